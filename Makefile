@@ -1,0 +1,99 @@
+# One folder holds everything: .tools/ (uv), .venv/ (the locked environment), runs/ (results).
+# The system's Python is asked for pip once and is otherwise left alone, so an
+# externally managed one without the venv module (Debian, Ubuntu) will do.
+
+PYTHON     ?= python3
+UV_VERSION := 0.13.9
+
+UV  := .tools/bin/uv
+BIN := .venv/bin
+
+# Somebody else's active environment (conda, ROS, a virtualenv) stays out of ours.
+unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV CONDA_PREFIX
+export UV_PYTHON_DOWNLOADS := never
+
+# The commands explain their own failures; make adds nothing.
+MAKEFLAGS += --silent --no-print-directory
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help report setup test test-all check format sample-logs bench clean lock
+
+help: ## What can be made
+	echo "gradetrace: from the log of an excavator's cameras to a trench report"
+	echo
+	awk -F ':.*## ' '/^[a-z%-]+:.*## / { printf "  make %-24s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST)) \
+	  | sed -e 's/make report      /make report LOG=... /' -e 's/make bench-%   /make bench-NAME/'
+	echo
+	echo "  ARGS='...' is handed on, for example: make report LOG=shift.mcap ARGS='--strict'"
+
+report: .venv/runtime.stamp ## Turn one log into tracks and a report
+	if [ -z '$(LOG)' ]; then \
+	  echo "make report needs a log, for example: make report LOG=sample_logs/trench/trench.mcap" >&2; exit 2; \
+	fi
+	$(BIN)/gradetrace report '$(LOG)' $(ARGS)
+
+test: .venv/dev.stamp ## Run the tests, without the slow ones
+	$(BIN)/pytest -n auto -m 'not slow' $(ARGS)
+
+test-all: .venv/dev.stamp ## Run every test
+	$(BIN)/pytest -n auto $(ARGS)
+
+check: .venv/dev.stamp ## Look for mistakes and untidiness, change nothing
+	$(BIN)/ruff check --quiet .
+	$(BIN)/ruff format --quiet --check .
+	$(BIN)/mypy --no-error-summary
+
+format: .venv/dev.stamp ## Tidy the code
+	$(BIN)/ruff check --quiet --fix-only .
+	$(BIN)/ruff format --quiet .
+
+sample-logs: .venv/dev.stamp ## Render the sample logs and those the benchmarks use
+	$(BIN)/python -m pipeline.synthetic $(ARGS)
+
+BENCHMARKS = $(subst _,-,$(filter-out _%,$(basename $(notdir $(wildcard benchmarks/*.py)))))
+
+bench: .venv/dev.stamp ## Run every benchmark and hold it against its bars
+	missed=; for name in $(BENCHMARKS); do $(MAKE) bench-$$name || missed="$$missed $$name"; done; \
+	if [ -n "$$missed" ]; then echo "benchmarks that missed a bar:$$missed" >&2; exit 1; fi
+
+bench-%: .venv/dev.stamp ## Run one benchmark, for example: make bench-main-job
+	$(BIN)/python -m benchmarks.$(subst -,_,$*) $(ARGS)
+
+setup: .venv/dev.stamp ## Make the environment and do nothing more
+
+clean: ## Remove the environment and what tools left behind; runs/ stays
+	rm -rf .tools .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -not -path './runs/*' -prune -exec rm -rf {} +
+
+lock: .tools/uv-$(UV_VERSION).stamp ## Pin every dependency anew, in the newest versions that fit
+	$(UV) pip compile pyproject.toml --group build --universal --generate-hashes --upgrade \
+	  --custom-compile-command 'make lock' --quiet --output-file requirements.lock
+	$(UV) pip compile pyproject.toml --group dev --universal --generate-hashes --upgrade --constraints requirements.lock \
+	  --custom-compile-command 'make lock' --quiet --output-file requirements-dev.lock
+
+# The environment. The development lock holds the runtime lock whole. Hashes cannot be asked of an
+# editable install, so the project itself comes second, built by the locked build backend.
+define install
+$(UV) pip sync --quiet --python $(BIN)/python --require-hashes --only-binary :all: $(1)
+$(UV) pip install --quiet --python $(BIN)/python --no-deps --no-build-isolation --editable .
+endef
+
+.venv/dev.stamp: requirements-dev.lock .venv/runtime.stamp
+	echo "Adding the tools for development"
+	$(call install,$<)
+	touch $@
+
+.venv/runtime.stamp: requirements.lock pyproject.toml .tools/uv-$(UV_VERSION).stamp
+	echo "Setting up the environment in .venv (some 300 MB the first time)"
+	$(BIN)/python -c '' 2>/dev/null || $(UV) venv --quiet --clear --no-project --python "$$($(PYTHON) -c 'import sys; print(sys.executable)')" .venv
+	$(call install,$<)
+	touch $@
+
+.tools/uv-$(UV_VERSION).stamp:
+	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
+	  echo "gradetrace needs Python 3.11 or newer; name one, for example: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 1; }
+	$(PYTHON) -c 'import pip' 2>/dev/null || { \
+	  echo "$(PYTHON) has no pip; on Debian and Ubuntu: apt install python3-pip" >&2; exit 1; }
+	PIP_USER=0 PIP_REQUIRE_VIRTUALENV=0 $(PYTHON) -m pip install --quiet --disable-pip-version-check \
+	  --root-user-action=ignore --upgrade --target .tools uv==$(UV_VERSION)
+	touch $@
