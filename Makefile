@@ -12,25 +12,25 @@ BIN := .venv/bin
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV CONDA_PREFIX
 export UV_PYTHON_DOWNLOADS := never
 
-# The commands explain their own failures; make adds nothing.
 MAKEFLAGS += --silent --no-print-directory
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help report setup test test-all check format sample-logs bench clean lock
+.PHONY: help report log-is-named setup test test-all check format sample-logs bench clean lock
 
 help: ## What can be made
 	echo "gradetrace: from the log of an excavator's cameras to a trench report"
 	echo
-	awk -F ':.*## ' '/^[a-z%-]+:.*## / { printf "  make %-24s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST)) \
-	  | sed -e 's/make report      /make report LOG=... /' -e 's/make bench-%   /make bench-NAME/'
+	awk -F ':.*## ' '/^[a-z%-]+:.*## / { sub("%", "NAME", $$1); sub("^report$$", "report LOG=FILE", $$1); \
+	  printf "  make %-17s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 	echo
 	echo "  ARGS='...' is handed on, for example: make report LOG=shift.mcap ARGS='--strict'"
 
-report: .venv/runtime.stamp ## Turn one log into tracks and a report
-	if [ -z '$(LOG)' ]; then \
-	  echo "make report needs a log, for example: make report LOG=sample_logs/trench/trench.mcap" >&2; exit 2; \
-	fi
+report: log-is-named .venv/runtime.stamp ## Turn one log into tracks and a report
 	$(BIN)/gradetrace report '$(LOG)' $(ARGS)
+
+log-is-named:
+	[ -n '$(LOG)' ] || { \
+	  echo "make report needs a log, for example: make report LOG=sample_logs/trench/trench.mcap" >&2; exit 2; }
 
 test: .venv/dev.stamp ## Run the tests, without the slow ones
 	$(BIN)/pytest -n auto -m 'not slow' $(ARGS)
