@@ -11,6 +11,8 @@ BIN := .venv/bin
 # Somebody else's active environment (conda, ROS, a virtualenv) stays out of ours.
 unexport PYTHONPATH PYTHONHOME VIRTUAL_ENV CONDA_PREFIX
 export UV_PYTHON_DOWNLOADS := never
+# uv's own list of certificates does not know a company's proxy; pip and the system do.
+export UV_SYSTEM_CERTS ?= true
 
 MAKEFLAGS += --silent --no-print-directory
 .DEFAULT_GOAL := help
@@ -39,9 +41,9 @@ test-all: .venv/dev.stamp ## Run every test
 	$(BIN)/pytest -n auto $(ARGS)
 
 check: .venv/dev.stamp ## Look for mistakes and untidiness, change nothing
-	$(BIN)/ruff check --quiet .
-	$(BIN)/ruff format --quiet --check .
-	$(BIN)/mypy --no-error-summary
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
 
 format: .venv/dev.stamp ## Tidy the code
 	$(BIN)/ruff check --quiet --fix-only .
