@@ -1,0 +1,108 @@
+"""Quantities with their uncertainty, as they stand in the two TOML files."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from pipeline.geometry import se3, so3
+
+Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")]
+Triple = tuple[float, float, float]
+NonNegative = Annotated[float, Field(ge=0)]
+Positive = Annotated[float, Field(gt=0)]
+SigmaTriple = tuple[NonNegative, NonNegative, NonNegative]
+
+
+class Section(BaseModel):
+    """A table of a TOML file: unknown keys are refused, values never change after loading."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Pose(Section):
+    """A calibrated rigid pose ``T_parent_child`` with the covariance of its right perturbation."""
+
+    xyz_m: Triple
+    """Origin of the child in the parent, metres."""
+    rpy_deg: Triple
+    """Roll, pitch, yaw in degrees: ``R = Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
+    sigma_mm: SigmaTriple | NonNegative | None = None
+    """Standard deviation of the origin along the child's axes, millimetres; 0 means exact."""
+    sigma_deg: SigmaTriple | NonNegative | None = None
+    """Standard deviation of the rotation about the child's axes, degrees; 0 means exact."""
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    """6x6 covariance of ``xi = [rho, phi]`` in m and rad instead of the two sigmas."""
+
+    @model_validator(mode="after")
+    def _one_uncertainty(self) -> Pose:
+        sigmas = self.sigma_mm is not None and self.sigma_deg is not None
+        if sigmas == (self.covariance is not None):
+            raise ValueError(
+                "give either sigma_mm and sigma_deg, or covariance (6x6); a pose is not exact by default"
+            )
+        if self.covariance is not None:
+            check_covariance(self.covariance, 6)
+        return self
+
+    def transform(self) -> np.ndarray:
+        """``T_parent_child``, (4, 4)."""
+        return se3.from_rotation_translation(so3.from_rpy_deg(np.array(self.rpy_deg)), np.array(self.xyz_m))
+
+    def covariance_xi(self) -> np.ndarray:
+        """(6, 6) covariance of ``xi = [rho, phi]``, m² and rad²."""
+        if self.covariance is not None:
+            return np.array(self.covariance)
+        sigma = np.concatenate(
+            [np.broadcast_to(self.sigma_mm, 3) / 1000.0, np.deg2rad(np.broadcast_to(self.sigma_deg, 3))]
+        )
+        return np.diag(sigma**2)
+
+
+def check_covariance(rows: tuple[tuple[float, ...], ...], size: int) -> None:
+    """Raise ValueError unless `rows` is a symmetric positive semi-definite size x size matrix."""
+    if len(rows) != size or any(len(row) != size for row in rows):
+        raise ValueError(f"covariance must be {size}x{size}")
+    matrix = np.array(rows)
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0):
+        raise ValueError("covariance must be symmetric")
+    if np.linalg.eigvalsh(matrix)[0] < -1e-9 * max(np.trace(matrix), 1e-30):
+        raise ValueError("covariance must have no negative eigenvalue")
+
+
+class Tag(Section):
+    """One printed tag on a marker, lying in the marker's plane with its axes along the marker's."""
+
+    id: Annotated[int, Field(ge=0, le=100_000)]
+    size_m: Positive
+    """Outer side of the black border, metres (tagStandard families: the side between the detected corners)."""
+    x_m: float = 0.0
+    """Centre of the tag in the marker frame, x to the right on the print, metres."""
+    y_m: float = 0.0
+    """Centre of the tag in the marker frame, y up on the print, metres."""
+
+    def corners(self) -> np.ndarray:
+        """(4, 3) corners in the marker frame, order (-,+) (+,+) (+,-) (-,-): TL TR BR BL of the print."""
+        signs = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], float)
+        return np.array([self.x_m, self.y_m, 0.0]) + 0.5 * self.size_m * signs
+
+
+FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "tagStandard41h12")
+
+
+class Print(Section):
+    """What is printed on a marker: the family and the layout of its tags."""
+
+    family: Annotated[str, Field(pattern="^(" + "|".join(FAMILIES) + ")$")]
+    tags: Annotated[tuple[Tag, ...], Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _ids_differ(self) -> Print:
+        ids = [tag.id for tag in self.tags]
+        if len(set(ids)) != len(ids):
+            raise ValueError(
+                f"the same tag id stands twice on one marker: {sorted(i for i in set(ids) if ids.count(i) > 1)}"
+            )
+        return self

@@ -1,0 +1,199 @@
+"""`site.toml`: one job, its grid, benchmarks, design, tolerances, check shots and settings."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field, field_validator, model_validator
+
+from pipeline.config.quantities import Name, NonNegative, Pose, Positive, Print, Section, SigmaTriple, Triple
+
+FORMAT = "gradetrace/site/1"
+METRES_PER_UNIT = {"m": 1.0, "international_foot": 0.3048, "us_survey_foot": 1200.0 / 3937.0}
+
+
+class SiteIdentity(Section):
+    id: Name
+    name: str = ""
+
+
+class Grid(Section):
+    """The survey grid all coordinates of this file and of the files it names are in."""
+
+    unit: Literal["m", "international_foot", "us_survey_foot"]
+    """'ft' alone is refused: the two feet differ by 1.2 m at 2,000,000 ft."""
+    origin: tuple[int, int, int]
+    """Easting, northing, elevation of the world's origin in the grid unit, whole numbers near the job."""
+    name: str = ""
+    """What the surveyor calls this grid and its height datum; printed on the report."""
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _which_foot(cls, value: object) -> object:
+        if value in ("ft", "foot", "feet"):
+            raise ValueError("'ft' does not say which foot: write 'international_foot' or 'us_survey_foot'")
+        return value
+
+    @property
+    def metres_per_unit(self) -> float:
+        return METRES_PER_UNIT[self.unit]
+
+    def to_world(self, enh: np.ndarray) -> np.ndarray:
+        """Grid coordinates (..., 3) in the grid unit -> world metres (..., 3)."""
+        return (np.asarray(enh, float) - np.array(self.origin)) * self.metres_per_unit
+
+    def to_grid_metres(self, p_world: np.ndarray) -> np.ndarray:
+        """World metres (..., 3) -> grid easting, northing, elevation in metres (..., 3)."""
+        return np.asarray(p_world, float) + np.array(self.origin) * self.metres_per_unit
+
+
+class SurveyedPose(Section):
+    """A marker's pose in the grid."""
+
+    enh: Triple
+    """Easting, northing, elevation of the marker's centre, grid unit."""
+    rpy_deg: Triple
+    """``R_grid_marker = Rz(yaw) @ Ry(pitch) @ Rx(roll)``, degrees."""
+    sigma_mm: SigmaTriple | NonNegative
+    """Of the centre, along the marker's axes."""
+    sigma_deg: SigmaTriple | NonNegative
+    """Of the rotation, about the marker's axes."""
+
+
+class SurveyedCorner(Section):
+    """One corner of a printed tag, shot with the total station."""
+
+    tag: Annotated[int, Field(ge=0)]
+    corner: Annotated[int, Field(ge=0, le=3)]
+    """0 top-left, 1 top-right, 2 bottom-right, 3 bottom-left of the print."""
+    enh: Triple
+
+
+class Benchmark(Print):
+    """A marker fixed on the site: its surveyed pose, or three or more surveyed corners."""
+
+    pose: SurveyedPose | None = None
+    corners: tuple[SurveyedCorner, ...] = ()
+    sigma_corner_mm: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_survey(self) -> Benchmark:
+        if (self.pose is None) == (not self.corners):
+            raise ValueError("give either pose, or at least three surveyed corners with sigma_corner_mm")
+        if self.corners and (len(self.corners) < 3 or self.sigma_corner_mm is None):
+            raise ValueError("surveyed corners need at least three of them and sigma_corner_mm")
+        ids = {tag.id for tag in self.tags}
+        for shot in self.corners:
+            if shot.tag not in ids:
+                raise ValueError(
+                    f"a corner of tag {shot.tag} was surveyed, but the tags of this benchmark are {sorted(ids)}"
+                )
+        return self
+
+
+class Alignment(Section):
+    """A polyline in the grid along which stations run."""
+
+    points: Annotated[tuple[tuple[float, float], ...], Field(min_length=2)]
+    """Easting, northing, grid unit."""
+    start_station: float = 0.0
+    """Station of the first point, grid unit."""
+
+
+class Design(Section):
+    file: str
+    """Beside site.toml (or beside the log, when site.toml came as an attachment)."""
+    kind: Literal["profile_csv", "landxml"]
+    surface: str | None = None
+    """LandXML: name of the surface; may be left out if there is only one."""
+    alignment: str | None = None
+    """LandXML: name of the alignment; may be left out if [alignment] stands in this file."""
+
+
+class Tolerance(Section):
+    """Deviation = as-built minus design; + is high (under-dug), - is low (over-dug)."""
+
+    high_mm: NonNegative
+    low_mm: NonNegative
+    coverage_factor: Positive = 2.0
+    """k in U = k sigma."""
+
+
+class Checks(Section):
+    """Total-station shots to compare with."""
+
+    file: str
+    order: Literal["PNEZD", "PENZD"]
+    """The two cannot be told apart from the file."""
+    sigma_mm: Positive = 2.0
+
+
+class DetectionSettings(Section):
+    quad_decimate: Annotated[float, Field(ge=1, le=4)] = 1.0
+    """1 searches every pixel; 2 is three times faster and loses tags under 25 px."""
+    decode_sharpening: Annotated[float, Field(ge=0, le=2)] = 0.25
+    max_hamming: Annotated[int, Field(ge=0, le=2)] = 1
+    min_margin: NonNegative = 20.0
+    """Decision margin below which a decoded tag is rejected."""
+
+
+class EstimationSettings(Section):
+    huber: Positive = 2.5
+    """Corner residual, in its own sigmas, beyond which its weight falls."""
+    max_iterations: Annotated[int, Field(ge=1, le=200)] = 30
+    max_gap_s: Positive = 5.0
+    """States further than this from an observation of their body are marked `bridged`."""
+
+
+class SurveySettings(Section):
+    cell_m: Annotated[float, Field(gt=0, le=1)] = 0.05
+    station_step_m: Annotated[float, Field(gt=0, le=100)] = 0.5
+    surface: Literal["lowest", "last"] = "lowest"
+    """The lower envelope of the sweep for digging; the last pass for placed material."""
+
+
+class ReportSettings(Section):
+    title: str = ""
+    company: str = ""
+    cross_section_step_m: Positive = 1.0
+
+
+class Site(Section):
+    """One job."""
+
+    format: Literal["gradetrace/site/1"]
+    site: SiteIdentity
+    grid: Grid
+    benchmarks: Annotated[dict[Name, Benchmark], Field(min_length=1)]
+    alignment: Alignment | None = None
+    design: Design
+    tolerance: Tolerance
+    checks: Checks | None = None
+    detection: DetectionSettings = DetectionSettings()
+    estimation: EstimationSettings = EstimationSettings()
+    survey: SurveySettings = SurveySettings()
+    report: ReportSettings = ReportSettings()
+
+    @model_validator(mode="after")
+    def _whole(self) -> Site:
+        if self.alignment is None and not (self.design.kind == "landxml" and self.design.alignment):
+            raise ValueError(
+                "stations need an alignment: give [alignment] points, or design.alignment of a LandXML file"
+            )
+        owner: dict[tuple[str, int], str] = {}
+        for name, mark in self.benchmarks.items():
+            for tag in mark.tags:
+                if (other := owner.setdefault((mark.family, tag.id), name)) != name:
+                    raise ValueError(
+                        f"tag {tag.id} of {mark.family} stands on two benchmarks, {other} and {name}"
+                    )
+        return self
+
+    def benchmark_pose(self, name: str) -> Pose | None:
+        """Surveyed pose of a benchmark in the world (metres), or None where corners were surveyed."""
+        pose = self.benchmarks[name].pose
+        if pose is None:
+            return None
+        x, y, z = self.grid.to_world(np.array(pose.enh)).tolist()
+        return Pose(xyz_m=(x, y, z), rpy_deg=pose.rpy_deg, sigma_mm=pose.sigma_mm, sigma_deg=pose.sigma_deg)
