@@ -209,8 +209,8 @@ def jr_inv_times_derivative(xi, w):
 def to_grid_covariance(T_world_body, cov_xi):
     """Published covariance of a pose: position and rotation vector along the grid axes.
 
-    To first order the position of ``T @ exp(xi)`` is off by ``R rho``; ``R exp(phi) = exp(R phi) R`` is exact. The
-    world has the axes of the grid, so its origin does not enter.
+    To first order the position of ``T @ exp(xi)`` is off by ``R rho``; ``R exp(phi) = exp(R phi) R`` is
+    exact. The world has the axes of the grid, so its origin does not enter.
 
     Parameters
     ----------
