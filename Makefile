@@ -85,10 +85,11 @@ endef
 	$(call install,$<)
 	touch $@
 
+# Where the tools for development are already, they stay.
 .venv/runtime.stamp: requirements.lock pyproject.toml .tools/uv-$(UV_VERSION).stamp
 	echo "Setting up the environment in .venv (some 300 MB the first time)"
 	$(BIN)/python -c '' 2>/dev/null || $(UV) venv --quiet --clear --no-project --python "$$($(PYTHON) -c 'import sys; print(sys.executable)')" .venv
-	$(call install,$<)
+	$(call install,$(or $(patsubst %,requirements-dev.lock,$(wildcard .venv/dev.stamp)),$<))
 	touch $@
 
 .tools/uv-$(UV_VERSION).stamp:
