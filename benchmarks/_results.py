@@ -1,0 +1,26 @@
+"""Where figures are kept: benchmarks/results/NAME.json, with the date and the class of machine."""
+
+from __future__ import annotations
+
+import dataclasses
+import datetime
+import json
+import os
+import platform
+from pathlib import Path
+from typing import Any
+
+FOLDER = Path(__file__).parent / "results"
+
+
+def machine_class() -> str:
+    """Cores, architecture and Python, and nothing that names one machine."""
+    return f"{os.cpu_count()} cores, {platform.machine()}, Python {platform.python_version()}"
+
+
+def keep_result(name: str, rows: list[Any], line: str) -> None:
+    """Write the rows (dataclasses or dicts) and the closing line of a benchmark."""
+    FOLDER.mkdir(exist_ok=True)
+    plain = [dataclasses.asdict(row) if dataclasses.is_dataclass(row) and not isinstance(row, type) else row for row in rows]
+    result = {"date": datetime.date.today().isoformat(), "machine": machine_class(), "line": line, "rows": plain}
+    (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1, default=float) + "\n", encoding="utf-8")
