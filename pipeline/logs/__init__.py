@@ -1,0 +1,1 @@
+"""MCAP logs in and out: messages, reading with recovery, the clock, writing."""
