@@ -236,4 +236,5 @@ def _shorten(xy, limit):
     """The points pulled radially inside ``limit``."""
     r = _norm(xy)
     outside = r > limit
-    return np.where(outside[..., None], xy * (limit / np.where(outside, r, 1.0))[..., None], xy)
+    scale = np.where(outside, limit, 1.0) / np.where(outside, r, 1.0)
+    return xy * scale[..., None]
