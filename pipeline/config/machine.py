@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from pipeline.config.quantities import Name, NonNegative, Pose, Positive, Print, Section, check_covariance
+from pipeline.errors import ConfigError
 
 FORMAT = "gradetrace/machine/1"
 
@@ -78,7 +80,10 @@ class Intrinsics(Section):
 
     def covariance_matrix(self) -> np.ndarray:
         """(9, 9)."""
-        return np.array(self.covariance) if self.covariance is not None else np.diag(np.square(self.sigma))
+        if self.covariance is not None:
+            return np.array(self.covariance)
+        assert self.sigma is not None
+        return np.diag(np.square(self.sigma))
 
 
 class Camera(Section):
@@ -123,7 +128,10 @@ class Curve(Section):
         return self
 
     def covariance_matrix(self) -> np.ndarray:
-        return np.array(self.covariance) if self.covariance is not None else np.diag(np.square(self.sigma))
+        if self.covariance is not None:
+            return np.array(self.covariance)
+        assert self.sigma is not None
+        return np.diag(np.square(self.sigma))
 
 
 class Linkage(Section):
@@ -236,3 +244,48 @@ class Machine(Section):
                     raise ValueError(f"bodies.{name}: its parents run in a circle")
                 seen.add(at)
         return self
+
+    def with_calibrations(self, calibrations: Mapping[str, Mapping[str, Any]], source: str) -> Machine:
+        """This machine with the intrinsics that it leaves out taken from the log.
+
+        Parameters
+        ----------
+        calibrations : mapping
+            Camera -> topic, width, height, fx, fy, cx, cy and distortion (k1 k2 p1 p2 k3), as the log has them.
+        source : str
+            How messages call the machine file.
+
+        Raises
+        ------
+        ConfigError
+            A camera has intrinsics neither here nor in the log, or no standard deviations to go with those of the log.
+        """
+        cameras = {}
+        for name, camera in self.cameras.items():
+            if camera.intrinsics is None:
+                if name not in calibrations:
+                    raise ConfigError(
+                        f"{source}: camera '{name}' has no intrinsics: there is no [cameras.{name}.intrinsics], and no "
+                        f"calibration in the log on {camera.calibration_topic or 'any topic'}; calibrate it"
+                    )
+                if camera.intrinsics_sigma is None:
+                    raise ConfigError(
+                        f"{source}: camera '{name}' takes its intrinsics from the log, which has no standard "
+                        f"deviations; add cameras.{name}.intrinsics_sigma (nine numbers: fx fy cx cy k1 k2 p1 p2 k3)"
+                    )
+                values = {key: calibrations[name][key] for key in ("width", "height", "fx", "fy", "cx", "cy")}
+                topic = calibrations[name].get("topic", "unknown topic")
+                try:
+                    intrinsics = Intrinsics(
+                        **values,
+                        distortion=tuple(calibrations[name]["distortion"]),
+                        sigma=camera.intrinsics_sigma,
+                    )
+                except ValidationError as error:
+                    raise ConfigError(
+                        f"camera '{name}': the calibration in the log ({topic}) cannot "
+                        f"be used: {error.errors()[0]['msg']}; add [cameras.{name}.intrinsics] to {source}"
+                    ) from None
+                camera = camera.model_copy(update={"intrinsics": intrinsics})
+            cameras[name] = camera
+        return self.model_copy(update={"cameras": cameras})

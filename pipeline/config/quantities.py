@@ -55,6 +55,7 @@ class Pose(Section):
         """(6, 6) covariance of ``xi = [rho, phi]``, m² and rad²."""
         if self.covariance is not None:
             return np.array(self.covariance)
+        assert self.sigma_mm is not None and self.sigma_deg is not None
         sigma = np.concatenate(
             [np.broadcast_to(self.sigma_mm, 3) / 1000.0, np.deg2rad(np.broadcast_to(self.sigma_deg, 3))]
         )
