@@ -38,9 +38,12 @@ class LogWriter:
 
     Parameters
     ----------
-    path : path of the log
-    chunk_size : bytes of messages after which a chunk ends; what a damaged spot costs.
-    compression : ``none``, ``zstd`` or ``lz4``
+    path
+        Of the log.
+    chunk_size
+        Bytes of messages after which a chunk ends; what a damaged spot costs.
+    compression
+        ``none``, ``zstd`` or ``lz4``.
     """
 
     def __init__(self, path: str | os.PathLike[str], chunk_size: int = 1 << 20, compression: str = "none"):
