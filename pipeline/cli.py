@@ -1,14 +1,206 @@
-"""The front door: what a person types."""
+"""The front door: what a person types.
+
+Imports of weight stand inside the commands, so that ``gradetrace --help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from pipeline import __version__
+from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
+
+if TYPE_CHECKING:
+    from pipeline.stages.job import Job
+
+EXIT_INTERRUPTED = 130
 
 
-@click.group()
+class FrontDoor(click.Group):
+    """Turns a fault of the input into one line and an exit code; a defect of ours keeps its traceback."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except PipelineError as error:
+            for line in str(error).splitlines():
+                click.echo(f"gradetrace: {line}", err=True)
+            sys.exit(error.exit_code)
+        except KeyboardInterrupt:
+            click.echo("gradetrace: interrupted; the same command goes on where this one stopped", err=True)
+            sys.exit(EXIT_INTERRUPTED)
+
+
+LOG = click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
+MACHINE = click.option(
+    "--machine",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="machine.toml to use; else the one beside the log, else the log's attachment.",
+)
+SITE = click.option(
+    "--site",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="site.toml to use; else the one beside the log, else the log's attachment.",
+)
+RUNS = click.option(
+    "--runs",
+    metavar="DIR",
+    type=click.Path(path_type=Path, file_okay=False),
+    default=Path("runs"),
+    show_default=True,
+    help="Where results go; each log has a folder of its own there.",
+)
+
+
+@click.group(cls=FrontDoor, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="gradetrace")
-def main():
+def main() -> None:
     """Turn the log of an excavator's cameras into poses and a trench report."""
+
+
+@main.command()
+@LOG
+@MACHINE
+@SITE
+@RUNS
+@click.option(
+    "--strict", is_flag=True, help="End with 4 if the verdict is FAIL, 5 if part of the log is lost."
+)
+@click.option(
+    "--jobs", metavar="N", type=click.IntRange(1, 512), help="Processes to use; by default all cores."
+)
+def report(
+    log: Path, machine: Path | None, site: Path | None, runs: Path, strict: bool, jobs: int | None
+) -> None:
+    """Run what is stale and write the report of LOG.
+
+    A second run does no work; a change to a setting redoes only the stages that use it; a run that was
+    killed goes on where it was.
+    """
+    from pipeline.progress import watch_on
+    from pipeline.stages.job import open_job
+    from pipeline.stages.runner import run_stale
+
+    job = open_job(
+        log, machine, site, runs, workers=jobs or usable_cores(), strict=strict, create_folder=True
+    )
+    _say_sources(job)
+    with job.folder.locked():
+        run_stale(job, watch_on())
+        verdict, complete = _outcome(job)
+    click.echo(f"report: {job.folder.file('report.html')} · verdict {verdict}")
+    if strict and verdict == "FAIL":
+        sys.exit(EXIT_VERDICT_FAIL)
+    if strict and not complete:
+        sys.exit(EXIT_PARTIAL_LOG)
+    sys.exit(EXIT_OK)
+
+
+@main.command()
+@LOG
+@MACHINE
+@SITE
+@RUNS
+def status(log: Path, machine: Path | None, site: Path | None, runs: Path) -> None:
+    """Say what is done for LOG, what is stale, and why."""
+    from pipeline.progress import count_words
+    from pipeline.stages.job import open_job
+    from pipeline.stages.runner import states
+
+    job = open_job(log, machine, site, runs)
+    _say_sources(job)
+    rows: list[tuple[str, ...]] = []
+    for state in states(job):
+        if state.why is None:
+            word = "✓ fresh"
+        elif state.manifest is None:
+            word = "· missing"
+        else:
+            word = "! stale"
+        counts = ", ".join(count_words(state.manifest.counts)) if state.manifest else ""
+        seconds = f"{state.manifest.seconds:.1f}" if state.manifest else ""
+        rows.append((state.stage.name, word, seconds, state.why or counts))
+    _print_table(("stage", "state", "seconds", ""), rows)
+    click.echo(f"run folder: {job.folder.path}")
+
+
+@main.command()
+@LOG
+@MACHINE
+@SITE
+def check(log: Path, machine: Path | None, site: Path | None) -> None:
+    """Say in a few seconds whether LOG is fit for a report, and if not, what to do.
+
+    Ends with 3 if there is an error.
+    """
+    from pipeline.preflight import examine
+
+    findings = examine(log, machine, site)
+    symbols = {"ok": "✓", "warning": "!", "error": "✗"}
+    for finding in findings:
+        click.echo(f"{symbols[finding.level]} {finding.level + ':':<9}{finding.sentence}")
+    errors = sum(finding.level == "error" for finding in findings)
+    warnings = sum(finding.level == "warning" for finding in findings)
+    if errors:
+        click.echo(
+            f"{log} is not fit for a report: {_plural(errors, 'error')}, {_plural(warnings, 'warning')}"
+        )
+        sys.exit(EXIT_BAD_INPUT)
+    click.echo(f"{log} is fit for a report: no error, {_plural(warnings, 'warning')}")
+
+
+@main.command("sample-logs", context_settings={"ignore_unknown_options": True}, add_help_option=False)
+@click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
+def sample_logs(arguments: tuple[str, ...]) -> None:
+    """Render logs of a site whose truth is known."""
+    from pipeline.synthetic.__main__ import main as render
+
+    render(list(arguments))
+
+
+def usable_cores() -> int:
+    """Cores this process may use; a container or `taskset` may leave it fewer than the machine has."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:
+        return os.cpu_count() or 1
+
+
+def _say_sources(job: Job) -> None:
+    for source in (job.machine_source, job.site_source):
+        where = {
+            "option": "as given",
+            "beside the log": "beside the log",
+            "attachment": "attachment of the log",
+        }[source.origin]
+        click.echo(f"{source.name}: {where}, sha256 {source.sha256[:12]}")
+
+
+def _outcome(job: Job) -> tuple[str, bool]:
+    """The verdict, and whether the log was read whole."""
+    import json
+
+    verdict = str(job.counts("report").get("verdict", "unknown"))
+    recovery = json.loads(job.folder.file("log.json").read_text(encoding="utf-8")).get("recovery", {})
+    return verdict, bool(recovery.get("complete", True))
+
+
+def _print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
+    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head) - 1)]
+    for row in [head, *rows]:
+        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
+        click.echo("  ".join([*cells, row[-1]]).rstrip())
+
+
+def _plural(number: int, noun: str) -> str:
+    return f"{number or 'no'} {noun}" + ("" if number == 1 else "s")
 
 
 if __name__ == "__main__":

@@ -153,15 +153,22 @@ class RunFolder:
     def file(self, relative: str) -> Path:
         return self.path / relative
 
+    def create(self) -> None:
+        """Make the folder. Raises ArtefactError."""
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise _storage_error(self.path, error) from error
+
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Hold the folder for this process, and clear away what a killed one left half-written.
 
         Raises ArtefactError when another process holds it. The lock dies with its process, so a kill leaves none.
         """
+        self.create()
         lock = self.file(".lock")
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
             stream = lock.open("a+")
         except OSError as error:
             raise _storage_error(lock, error) from error
@@ -275,7 +282,8 @@ class RunFolder:
         if not isinstance(cache, dict):
             cache = {}
         cache[key] = {"identity": identity, "sha256": found}
-        atomic_write(cache_file, json_bytes(cache))
+        if self.path.is_dir():
+            atomic_write(cache_file, json_bytes(cache))
         return found
 
 

@@ -284,6 +284,7 @@ def open_job(
     runs: Path = Path("runs"),
     workers: int = 1,
     strict: bool = False,
+    create_folder: bool = False,
 ) -> Job:
     """The job of a log, everything that it names found, read and hashed.
 
@@ -297,6 +298,8 @@ def open_job(
     check_log_file(log)
     machine_model, machine_source, site_model, site_source = describe(log, machine, site)
     folder = RunFolder(runs / log.stem)
+    if create_folder:
+        folder.create()
     return Job(
         log=log,
         log_sha256=folder.hash_file(log),
