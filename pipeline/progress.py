@@ -13,7 +13,8 @@ if TYPE_CHECKING:
 
     from pipeline.runs import Manifest
     from pipeline.stages import Stage
-    from pipeline.stages.runner import Progress, Watch
+    from pipeline.stages.job import Progress
+    from pipeline.stages.runner import Watch
 
 PLAIN_LINE_EVERY_S = 10.0
 """Often enough to see that a log of a whole shift moves, seldom enough for a CI log."""

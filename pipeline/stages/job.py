@@ -7,7 +7,7 @@ import json
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -20,6 +20,20 @@ from pipeline.stages import Stage, stage_named
 
 Counts = dict[str, Any]
 """Word -> number, or word -> {reason: number}; in the order in which they are printed."""
+
+
+class Progress(Protocol):
+    """What a stage tells of its work while it runs; `pipeline.progress` shows it to people."""
+
+    def total(self, amount: float, unit: str = "") -> None:
+        """How much there is to do; `unit` is a plural noun, for example "frames"."""
+
+    def advance(self, amount: float = 1) -> None:
+        """So much more has been done."""
+
+    def warn(self, sentence: str) -> None:
+        """A sentence that a person should read though the stage goes on."""
+
 
 MAX_NAMED_FILE_BYTES = 200_000_000
 """A design surface of a large site has some 50 MB; more is a mistake or an attack."""

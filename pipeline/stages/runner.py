@@ -13,20 +13,7 @@ from pipeline import tables
 from pipeline.errors import ArtefactError
 from pipeline.runs import Manifest, fingerprint, sha256_of
 from pipeline.stages import STAGES, Stage, stage_named
-from pipeline.stages.job import Job
-
-
-class Progress(Protocol):
-    """What a stage tells of its work while it runs; `pipeline.progress` shows it to people."""
-
-    def total(self, amount: float, unit: str = "") -> None:
-        """How much there is to do; `unit` is a plural noun, for example "frames"."""
-
-    def advance(self, amount: float = 1) -> None:
-        """So much more has been done."""
-
-    def warn(self, sentence: str) -> None:
-        """A sentence that a person should read though the stage goes on."""
+from pipeline.stages.job import Job, Progress
 
 
 class Watch(Protocol):
