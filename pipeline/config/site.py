@@ -156,6 +156,8 @@ class SurveySettings(Section):
 class ReportSettings(Section):
     title: str = ""
     company: str = ""
+    time_zone: str = ""
+    """Name in the IANA database, for example `Europe/Helsinki`: the report then shows the site's clock beside UTC."""
     cross_section_step_m: Positive = 1.0
 
 
