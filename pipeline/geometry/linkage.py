@@ -158,10 +158,7 @@ def stroke(params, side=1):
     ends = [np.hypot(*(A - P)) + rocker_m, abs(np.hypot(*(A - P)) - rocker_m)]
     for reach in (horn_m + coupler_m, abs(horn_m - coupler_m)):  # coupler and horn in line: |E| = reach
         ends += [np.hypot(*(E - A)) for E in _meet(P, rocker_m, O, reach)]
-    for reach in (
-        rocker_m + coupler_m,
-        rocker_m - coupler_m,
-    ):  # rocker and coupler in line: |H - P| = |reach|
+    for reach in (rocker_m + coupler_m, rocker_m - coupler_m):  # those two in line: |H - P| = |reach|
         for H in _meet(P, abs(reach), O, horn_m):
             E = P + rocker_m * (H - P) / reach
             ends.append(np.hypot(*(E - A)))

@@ -67,7 +67,7 @@ def test_a_longer_cylinder_turns_the_bucket_one_way_only(side, params):
 def test_outside_the_stroke_there_is_no_angle(side, params):
     low, high = linkage.stroke(params, side)
     assert np.isfinite(linkage.bucket_angle([low + 1e-9, high - 1e-9], params, side)).all()
-    assert np.isnan(linkage.bucket_angle([low - 1e-9, high + 1e-9, -1.0, 100.0], params, side)).all()
+    assert np.isnan(linkage.bucket_angle([low - 1e-9, high + 1e-9, -1.6, 100.0], params, side)).all()
     assert np.isnan(linkage.bucket_angle_with_jacobians(high + 0.1, params, side)[2]).all()
 
 
@@ -84,7 +84,7 @@ def test_stroke_ends_at_the_dead_centre_that_comes_first():
     assert low == pytest.approx(np.hypot(*(E - params[:2])) - params[8], rel=1e-12)
 
 
-def test_stroke_is_the_widest_run_of_lengths_that_work():
+def test_stroke_is_the_widest_run_of_lengths_that_work_and_the_angle_is_monotone_on_it():
     rng = np.random.default_rng(12)
     scan = np.linspace(0.0, 5.0, 50_001)
     ends = []
@@ -102,8 +102,22 @@ def test_stroke_is_the_widest_run_of_lengths_that_work():
         widest = np.argmax(stops - starts)
         assert scan[starts[widest]] == pytest.approx(low, abs=1.01e-4)
         assert scan[stops[widest] - 1] == pytest.approx(high, abs=1.01e-4)
+        length = np.linspace(low, high, 2001)[1:-1]
+        angle = linkage.bucket_angle(length, params)
+        assert np.all(np.diff(np.unwrap(angle)) < 0)
+        assert np.allclose(linkage.cylinder_length(angle, params), length, rtol=0, atol=1e-9)
         ends.append((low, high))
     assert len(ends) > 100
+
+
+@SIDES
+def test_an_angle_that_no_length_reaches_has_no_length(side, params):
+    angle = np.linspace(-np.pi, np.pi, 2001)
+    length = linkage.cylinder_length(angle, params, side)
+    reached = np.isfinite(length)
+    assert 0 < reached.sum() < len(angle)
+    back = linkage.bucket_angle(length[reached], params, side)
+    assert np.allclose(np.exp(1j * back), np.exp(1j * angle[reached]), rtol=0, atol=1e-10)
 
 
 def test_bars_that_cannot_meet_have_no_stroke():

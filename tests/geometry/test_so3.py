@@ -94,6 +94,13 @@ def test_roll_pitch_yaw_give_the_rotation_back_in_gimbal_lock(pitch_deg):
     assert np.allclose(so3.from_rpy_deg(so3.to_rpy_deg(R)), R, rtol=0, atol=ROUNDING)
 
 
+def test_roll_survives_a_pitch_of_exactly_ninety_degrees():
+    # All four elements from which roll and yaw are usually read are exact zeros.
+    c, s = np.cos(0.3), np.sin(0.3)
+    R = np.array([[0, s, c], [0, c, -s], [-1, 0, 0]])
+    assert np.allclose(so3.to_rpy_deg(R), [np.rad2deg(0.3), 90.0, 0.0], rtol=0, atol=1e-12)
+
+
 @repeatable
 @given(vectors)
 def test_quaternion_is_scipys_with_the_scalar_last_and_not_negative(phi):
