@@ -17,7 +17,7 @@ export UV_SYSTEM_CERTS ?= true
 MAKEFLAGS += --silent --no-print-directory
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help report log-is-named setup test test-all check format sample-logs bench clean lock
+.PHONY: help report log-is-named setup test test-all check format schemas sample-logs bench clean lock
 
 help: ## What can be made
 	echo "gradetrace: from the log of an excavator's cameras to a trench report"
@@ -48,6 +48,9 @@ check: .venv/dev.stamp ## Look for mistakes and untidiness, change nothing
 format: .venv/dev.stamp ## Tidy the code
 	$(BIN)/ruff check --quiet --fix-only .
 	$(BIN)/ruff format --quiet .
+
+schemas: .venv/dev.stamp ## Export the schemas of machine.toml and site.toml from their models
+	$(BIN)/python -m pipeline.config.export
 
 sample-logs: .venv/dev.stamp ## Render the sample logs and those the benchmarks use
 	$(BIN)/python -m pipeline.synthetic $(ARGS)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
@@ -34,51 +34,106 @@ def load_site(text: str, source: str) -> Site:
     return _load(text, source, Site)
 
 
-def read_text(path: Path) -> str:
-    """Text of a configuration file. Raises ConfigError when it cannot be read."""
+def read_file(path: Path) -> bytes:
+    """Bytes of a configuration file. Raises ConfigError when it cannot be read."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise ConfigError(
                 f"{path}: larger than {MAX_BYTES // 1_000_000} MB; this is no machine or site file"
             )
-        return path.read_text(encoding="utf-8")
+        return path.read_bytes()
     except FileNotFoundError:
         raise ConfigError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"{path}: cannot be read as UTF-8 text ({error})") from None
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+
+
+def decode(data: bytes, source: str) -> str:
+    """Text of a configuration file. Raises ConfigError when it is not UTF-8."""
+    try:
+        # Windows editors put a byte order mark in front, which TOML does not know.
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data[: error.start].count(b"\n") + 1
+        raise ConfigError(f"{source}:{line}: is not UTF-8 text; save it as UTF-8") from None
 
 
 def _load(text: str, source: str, model: type[Model]) -> Model:
     try:
         data = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(f"{source}: not valid TOML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{source}: not valid TOML: nested too deeply") from None
+    except ValueError as error:  # also int() of thousands of digits
+        where = re.search(r"\(at line (\d+), column \d+\)", str(error))
+        line = f":{where.group(1)}" if where else ""
+        raise ConfigError(f"{source}{line}: not valid TOML: {error}") from None
     try:
-        return model.model_validate(data)
+        # Strict, or "3" and true would pass for numbers; strict knows tuples, TOML only lists.
+        return model.model_validate(_tuples(data), strict=True)
     except ValidationError as error:
-        raise ConfigError(_sentences(error, text, source)) from None
+        raise ConfigError(_sentences(error, data, text, source)) from None
 
 
-def _sentences(error: ValidationError, text: str, source: str) -> str:
-    """One line per complaint, at most five."""
-    problems = error.errors(include_url=False)
+def _tuples(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _tuples(item) for key, item in value.items()}
+    if isinstance(value, list):
+        return tuple(_tuples(item) for item in value)
+    return value
+
+
+def _sentences(error: ValidationError, data: dict[str, Any], text: str, source: str) -> str:
+    """One line per key that is at fault, at most five."""
+    messages: dict[Location, list[str]] = {}
+    found: dict[Location, str] = {}
+    for problem in error.errors(include_url=False):
+        # pydantic also calls the third number of a pair of numbers missing.
+        missing = problem["type"] == "missing" and isinstance(problem["loc"][-1], str)
+        location = _in_file(problem["loc"], data, missing)
+        message = {
+            "missing": "is missing" if missing else "has too few values",
+            "extra_forbidden": "is not a key that is known here",
+        }.get(
+            problem["type"],
+            problem["msg"].removeprefix("Value error, ").replace("Input should be", "should be"),
+        )
+        if not location and (quoted := _quoted_key(message, data)):
+            location, message = quoted
+        if message not in messages.setdefault(location, []):
+            messages[location].append(message)
+        if not missing and problem["type"] != "value_error":
+            found[location] = f"; found {_short(problem['input'])}"
     lines = []
-    for problem in problems[:5]:
-        location = tuple(
-            part for part in problem["loc"] if part not in ("moving", "joint", "static", "function-after")
-        )
+    for location, said in list(messages.items())[:5]:
         line = line_of(text, location)
-        key = ".".join(str(part) for part in location) or "the whole file"
-        found = "" if problem["type"] in ("missing", "value_error") else f"; found {_short(problem['input'])}"
-        message = problem["msg"].removeprefix("Value error, ")
-        message = {"missing": "is missing", "extra_forbidden": "is not a key that is known here"}.get(
-            problem["type"], message
-        )
+        key = ".".join(str(part) for part in location)
         where = f"{source}:{line}" if line else source
-        lines.append(f"{where}: {key}: {message}{found}")
-    if len(problems) > 5:
-        lines.append(f"{source}: and {len(problems) - 5} more")
+        # A value that fits none of several forms brings one message for each of them.
+        lines.append(f"{where}: {key + ': ' if key else ''}{' or '.join(said)}{found.get(location, '')}")
+    if len(messages) > 5:
+        lines.append(f"{source}: and {len(messages) - 5} more")
     return "\n".join(lines)
+
+
+def _in_file(location: Location, data: Any, missing: bool) -> Location:
+    """The parts of pydantic's location that are keys of the file; it adds the names of types it tried."""
+    kept: list[str | int] = []
+    at = data
+    for number, part in enumerate(location):
+        known = part in at if isinstance(at, dict) else isinstance(at, list) and part in range(len(at))
+        if known:
+            at = at[part]
+        elif not (missing and number == len(location) - 1):
+            continue
+        kept.append(part)
+    return tuple(kept)
+
+
+def _quoted_key(message: str, data: dict[str, Any]) -> tuple[Location, str] | None:
+    """The key that a message of a check across tables begins with, and the rest of the message."""
+    first, _, rest = message.partition(" ")
+    location = tuple(first.rstrip(":").split("."))
+    return (location, rest) if rest and _in_file(location, data, False) == location else None
 
 
 def _short(value: object) -> str:
@@ -91,15 +146,27 @@ def line_of(text: str, location: Location) -> int | None:
     wanted = [str(part) for part in location]
     best: tuple[int, int] | None = None
     table: list[str] = []
+    arrays: dict[tuple[str, ...], int] = {}
     for number, line in enumerate(text.splitlines(), 1):
-        if header := re.match(r"\s*\[\[?([^\[\]]+)\]\]?\s*(#.*)?$", line):
-            table = [part.strip().strip("\"'") for part in header.group(1).split(".")]
+        if header := re.match(r"\s*(\[\[?)([^\[\]]+)\]\]?\s*(#.*)?$", line):
+            table = []
+            names = _key_parts(header.group(2))
+            for depth, name in enumerate(names, 1):
+                table.append(name)
+                if header.group(1) == "[[" and depth == len(names):
+                    arrays[tuple(table)] = arrays.get(tuple(table), -1) + 1
+                if tuple(table) in arrays:
+                    table.append(str(arrays[tuple(table)]))
             path = table
         elif key := re.match(r"\s*([A-Za-z0-9_.\"'-]+)\s*=", line):
-            path = table + [part.strip().strip("\"'") for part in key.group(1).split(".")]
+            path = table + _key_parts(key.group(1))
         else:
             continue
         depth = len(path)
         if path == wanted[:depth] and (best is None or depth > best[0]):
             best = (depth, number)
     return best[1] if best else None
+
+
+def _key_parts(dotted: str) -> list[str]:
+    return [part.strip().strip("\"'") for part in dotted.split(".")]

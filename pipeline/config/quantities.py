@@ -19,7 +19,8 @@ SigmaTriple = tuple[NonNegative, NonNegative, NonNegative]
 class Section(BaseModel):
     """A table of a TOML file: unknown keys are refused, values never change after loading."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # Field docstrings become descriptions in the exported JSON Schemas, which editors show.
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
 class Pose(Section):
@@ -90,7 +91,8 @@ class Tag(Section):
         return np.array([self.x_m, self.y_m, 0.0]) + 0.5 * self.size_m * signs
 
 
-FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "tagStandard41h12")
+FAMILIES = {"tag36h11": 587, "tag25h9": 35, "tag16h5": 30, "tagStandard41h12": 2115}
+"""Family -> how many tags it has; their ids run from 0."""
 
 
 class Print(Section):
@@ -105,5 +107,9 @@ class Print(Section):
         if len(set(ids)) != len(ids):
             raise ValueError(
                 f"the same tag id stands twice on one marker: {sorted(i for i in set(ids) if ids.count(i) > 1)}"
+            )
+        if max(ids) >= FAMILIES[self.family]:
+            raise ValueError(
+                f"{self.family} has the ids 0 to {FAMILIES[self.family] - 1}, there is no tag {max(ids)} in it"
             )
         return self

@@ -10,6 +10,8 @@ from pydantic import Field, field_validator, model_validator
 from pipeline.config.quantities import Name, NonNegative, Pose, Positive, Print, Section, SigmaTriple, Triple
 
 FORMAT = "gradetrace/site/1"
+MAX_FROM_ORIGIN_M = 20_000.0
+"""No job is that long: further away, two coordinates were swapped or the unit is another."""
 METRES_PER_UNIT = {"m": 1.0, "international_foot": 0.3048, "us_survey_foot": 1200.0 / 3937.0}
 
 
@@ -190,6 +192,15 @@ class Site(Section):
                     raise ValueError(
                         f"tag {tag.id} of {mark.family} stands on two benchmarks, {other} and {name}"
                     )
+        for name, mark in self.benchmarks.items():
+            shots = [mark.pose.enh] if mark.pose else [shot.enh for shot in mark.corners]
+            away_m = max(float(np.linalg.norm(self.grid.to_world(np.array(enh)))) for enh in shots)
+            if away_m > MAX_FROM_ORIGIN_M:
+                raise ValueError(
+                    f"benchmarks.{name} lies {away_m / 1000:,.0f} km from grid.origin "
+                    f"(limit {MAX_FROM_ORIGIN_M / 1000:.0f} km): check the order "
+                    "easting, northing, elevation, the unit, and the origin"
+                )
         return self
 
     def benchmark_pose(self, name: str) -> Pose | None:

@@ -18,7 +18,8 @@ Each stage is one module ``pipeline/stages/<name>.py`` with one function::
 - ``progress.total(amount, unit)`` once, ``progress.advance(amount)`` as work is done; ``progress.warn(sentence)`` for
   what a person should know though the stage goes on: printed, kept in the manifest, shown on the report.
 - It returns its counts: word -> number, or word -> {reason: number}, printed as "860 frames, 41 rejected (border 3,
-  ...)" and kept in the manifest. Those of the report have "verdict": PASS, FAIL or CANNOT TELL. The report asks for them with ``job.counts("detect")``, ``job.warnings("detect")``.
+  ...)" and kept in the manifest. The report stage's counts have "verdict": PASS, FAIL or CANNOT TELL. The report asks
+  for those of the others with ``job.counts("detect")`` and ``job.warnings("detect")``.
 
 `log.json`, written by ingest: {"recovery": fields of `logs.reader.Recovery`, "start_ns", "end_ns", "channels": [...],
 "clock": {...}, "calibrations": {camera: {"topic", "width", "height", "fx", "fy", "cx", "cy", "distortion": [5]}}}.

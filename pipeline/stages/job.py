@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline import tables
 from pipeline.config import Machine, Site, load_machine, load_site
-from pipeline.config.document import read_text
+from pipeline.config.document import decode, read_file
 from pipeline.errors import ArtefactError, ConfigError, LogError, UsageError
 from pipeline.runs import RunFolder, atomic_write, json_bytes
 from pipeline.stages import Stage, stage_named
@@ -199,29 +199,33 @@ def describe(
     `attachments` are read from the log when they are needed and not given.
     Raises ConfigError, LogError, UsageError.
     """
-    texts = {}
-    for kind, option in (("machine.toml", machine), ("site.toml", site)):
-        beside = log.parent / kind
+    machine_data, machine_name, machine_source = _description(log, "machine.toml", machine, attachments)
+    site_data, site_name, site_source = _description(log, "site.toml", site, attachments)
+    return (
+        load_machine(decode(machine_data, machine_name), machine_name),
+        machine_source,
+        load_site(decode(site_data, site_name), site_name),
+        site_source,
+    )
+
+
+def _description(
+    log: Path, kind: str, option: Path | None, attachments: dict[str, bytes] | None
+) -> tuple[bytes, str, Source]:
+    """Bytes of a description, how messages call it, and its source."""
+    if option is not None and not option.is_file():
+        raise UsageError(f"--{kind.removesuffix('.toml')} {option}: no such file")
+    beside = log.parent / kind
+    if option is not None or beside.is_file():
+        path = option or beside
+        data, name, origin, folder = read_file(path), str(path), "beside the log", path.parent
         if option is not None:
-            if not option.is_file():
-                raise UsageError(f"--{kind.removesuffix('.toml')} {option}: no such file")
-            texts[kind] = (read_text(option), str(option), Source(option.name, "option", "", option.parent))
-        elif beside.is_file():
-            texts[kind] = (read_text(beside), str(beside), Source(kind, "beside the log", "", log.parent))
-        else:
-            if attachments is None:
-                attachments = _attachments(log)
-            text = _attached_text(attachments, kind, log)
-            texts[kind] = (
-                text,
-                f"{kind} (attachment of {log.name})",
-                Source(kind, "attachment", "", log.parent),
-            )
-    text, name, source = texts["machine.toml"]
-    machine_model, machine_source = load_machine(text, name), replace(source, sha256=_sha256(text))
-    text, name, source = texts["site.toml"]
-    site_model, site_source = load_site(text, name), replace(source, sha256=_sha256(text))
-    return machine_model, machine_source, site_model, site_source
+            origin = "option"
+    else:
+        data = _attached(_attachments(log) if attachments is None else attachments, kind, log)
+        name, origin, folder = f"{kind} (attachment of {log.name})", "attachment", log.parent
+    sha256 = hashlib.sha256(data).hexdigest()
+    return data, name, Source(option.name if option else kind, origin, sha256, folder)
 
 
 def _attachments(log: Path) -> dict[str, bytes]:
@@ -231,20 +235,13 @@ def _attachments(log: Path) -> dict[str, bytes]:
         return reader.attachments()
 
 
-def _attached_text(attachments: dict[str, bytes], kind: str, log: Path) -> str:
-    try:
-        return attachments[kind].decode("utf-8")
-    except KeyError:
+def _attached(attachments: dict[str, bytes], kind: str, log: Path) -> bytes:
+    if kind not in attachments:
         raise ConfigError(
             f"no {kind} for {log}: there is none beside the log and the log carries none as an attachment; "
             f"put one beside the log, or name it with --{kind.removesuffix('.toml')}"
-        ) from None
-    except UnicodeDecodeError:
-        raise ConfigError(f"{kind} (attachment of {log.name}): is not UTF-8 text") from None
-
-
-def _sha256(text: str) -> str:
-    return hashlib.sha256(text.encode("utf-8")).hexdigest()
+        )
+    return attachments[kind]
 
 
 def named_files(site: Site, source: Source, folder: RunFolder) -> dict[str, NamedFile]:
