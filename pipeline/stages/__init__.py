@@ -47,6 +47,8 @@ def _reading(job: Job) -> Settings:
             name: {
                 "topic": camera.topic,
                 "calibration": None if camera.intrinsics else (camera.calibration_topic or "any"),
+                # Held against the pictures' own.
+                "size": [camera.intrinsics.width, camera.intrinsics.height] if camera.intrinsics else None,
             }
             for name, camera in job.machine.cameras.items()
         },

@@ -1,0 +1,74 @@
+"""Which of the tags found in a picture are believed, and why the others are not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Set
+
+import numpy as np
+
+from pipeline.config.site import DetectionSettings
+from pipeline.detection.apriltag import Found
+from pipeline.detection.noise import widths_across
+
+ACCEPTED = "accepted"
+UNKNOWN_ID = "unknown id"
+BIT_ERRORS = "bit errors"
+LOW_MARGIN = "low margin"
+TOO_SMALL = "too small"
+BORDER = "border"
+TWICE = "twice in one frame"
+
+BORDER_PX = 2.0
+"""A corner this near to the border of the picture was fitted to edges that are cut off."""
+MIN_WIDTH_PX = 8.0
+"""Width across the narrow way below which the noise of a corner was not measured."""
+
+KnownTags = Mapping[str, Set[int]]
+"""Family -> ids that machine.toml and site.toml describe."""
+
+
+def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: DetectionSettings) -> np.ndarray:
+    """The status of each tag: ``accepted``, or the reason why not.
+
+    Parameters
+    ----------
+    found : Found
+        n tags of one picture.
+    known : mapping
+        Family -> ids that are described.
+    shape : (int, int)
+        Height and width of the picture.
+    settings : DetectionSettings
+        Margin and bit errors that are let pass.
+
+    Returns
+    -------
+    (n,) object array of strings
+    """
+    status = np.full(len(found), ACCEPTED, object)
+    if not len(found):
+        return status
+    limits = np.array([shape[1], shape[0]]) - 1 - BORDER_PX
+    touching = np.any((found.uv < BORDER_PX) | (found.uv > limits), axis=(1, 2))
+    described = np.array(
+        [int(number) in known.get(family, ()) for family, number in zip(found.family, found.tag_id)]
+    )
+    # From the mildest reason to the gravest: the gravest is the one that is told.
+    status[touching] = BORDER
+    status[widths_across(found.uv).min(axis=1) < MIN_WIDTH_PX] = TOO_SMALL
+    status[_doubled(found, settings)] = TWICE
+    status[found.margin < settings.min_margin] = LOW_MARGIN
+    status[found.hamming > settings.max_hamming] = BIT_ERRORS
+    status[~described] = UNKNOWN_ID
+    return status
+
+
+def _doubled(found: Found, settings: DetectionSettings) -> np.ndarray:
+    """Whether another tag of the same family and id is in the picture: then neither can be told apart.
+
+    A poorly decoded one does not count: it is more likely a mistake than a second print.
+    """
+    sound = (found.margin >= settings.min_margin) & (found.hamming <= settings.max_hamming)
+    keys = [(family, int(number)) for family, number in zip(found.family, found.tag_id)]
+    seen = [key for key, good in zip(keys, sound) if good]
+    return np.array([good and seen.count(key) > 1 for key, good in zip(keys, sound)])

@@ -1,0 +1,154 @@
+"""detect: every frame searched for tags; `detections/<camera>`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+
+import numpy as np
+
+from pipeline import tables
+from pipeline.detection.acceptance import ACCEPTED, UNKNOWN_ID, KnownTags
+from pipeline.detection.slices import (
+    CORRUPT,
+    SEARCHED,
+    Search,
+    Slice,
+    read_piece,
+    search_slices,
+    slices_of,
+)
+from pipeline.errors import DetectionError
+from pipeline.logs.reader import read_log
+from pipeline.stages.job import Counts, Job
+from pipeline.stages.runner import Progress
+
+NEARLY_ALL = 0.9
+"""Part of a camera's frames that must be corrupt before the job is given up."""
+PORTION_ROWS = 65_536
+
+
+def run(job: Job, progress: Progress) -> Counts:
+    """Write `detections` of every camera. Raises DetectionError, LogError."""
+    known = known_tags(job)
+    cameras = job.read_json("log.json")["cameras"]
+    topics = {name: camera["topic"] for name, camera in cameras.items()}
+    sizes = {name: (camera["width"], camera["height"]) for name, camera in cameras.items()}
+    slices = slices_of(job.read_table("frames"), topics, job.scratch)
+    with read_log(job.log) as reader:
+        contents = reader.contents
+    search = Search(job.log, contents, tuple(sorted(known)), known, sizes, job.site.detection)
+    progress.total(sum(len(part.frame) for part in slices), "frames")
+    search_slices(search, slices, job.workers, lambda part: progress.advance(len(part.frame)))
+
+    frames: Counter[str] = Counter()
+    status: Counter[str] = Counter()
+    accepted: dict[str, int] = {}
+    seen: Counter[tuple[str, int]] = Counter()
+    for camera in topics:
+        mine = [part for part in slices if part.camera == camera]
+        of_camera, tags, ids = _join(job, camera, mine)
+        _judge_pictures(camera, of_camera, progress)
+        frames.update(of_camera)
+        status.update(tags)
+        seen.update(ids)
+        accepted[camera] = tags[ACCEPTED]
+    _refuse_without_markers(job, frames, status, seen, known)
+    for camera, count in accepted.items():
+        if not count:
+            progress.warn(f"camera '{camera}': not one marker was accepted in its frames")
+    return {
+        "frames": dict(frames.most_common()),
+        "tags accepted": accepted,
+        "tags rejected": {name: count for name, count in status.most_common() if name != ACCEPTED},
+    }
+
+
+def known_tags(job: Job) -> dict[str, frozenset[int]]:
+    """Family -> ids that machine.toml and site.toml describe."""
+    ids: dict[str, set[int]] = {}
+    for marker in [*job.machine.markers.values(), *job.site.benchmarks.values()]:
+        ids.setdefault(marker.family, set()).update(tag.id for tag in marker.tags)
+    return {family: frozenset(numbers) for family, numbers in sorted(ids.items())}
+
+
+def _join(
+    job: Job, camera: str, slices: Sequence[Slice]
+) -> tuple[Counter[str], Counter[str], Counter[tuple[str, int]]]:
+    """Put the pieces of a camera together; frames by outcome, tags by status, unknown tags by family and id."""
+    frames: Counter[str] = Counter()
+    status: Counter[str] = Counter()
+    unknown: Counter[tuple[str, int]] = Counter()
+    kept: list[dict[str, np.ndarray]] = [tables.empty_columns("detections")]
+    with job.table_writer("detections", part=camera) as writer:
+        for number, part in enumerate(slices):
+            piece = read_piece(part)
+            kept.append(piece.columns)
+            frames.update(piece.frames)
+            status.update(piece.columns["status"].tolist())
+            rows = piece.columns["status"] == UNKNOWN_ID
+            good = (
+                rows
+                & (piece.columns["hamming"] == 0)
+                & (piece.columns["margin"] >= job.site.detection.min_margin)
+            )
+            unknown.update(
+                zip(piece.columns["family"][good].tolist(), piece.columns["tag_id"][good].tolist())
+            )
+            last = number == len(slices) - 1
+            if last or sum(len(columns["frame"]) for columns in kept) >= PORTION_ROWS:
+                writer.write({name: np.concatenate([columns[name] for columns in kept]) for name in kept[0]})
+                kept = [tables.empty_columns("detections")]
+    return frames, status, unknown
+
+
+def _judge_pictures(camera: str, frames: Counter[str], progress: Progress) -> None:
+    total = sum(frames.values())
+    for outcome, count in frames.items():
+        if outcome == SEARCHED or not count:
+            continue
+        if count > NEARLY_ALL * total:
+            raise DetectionError(
+                f"camera '{camera}': {count} of {total} frames cannot be used ({outcome}); "
+                "look at the recording with another viewer: the camera, its driver or the disk is at fault"
+            )
+        what = "are corrupt" if outcome == CORRUPT else f"cannot be used ({outcome})"
+        progress.warn(f"camera '{camera}': {count} of {total} frames {what} and were skipped")
+
+
+def _refuse_without_markers(
+    job: Job,
+    frames: Counter[str],
+    status: Counter[str],
+    seen: Counter[tuple[str, int]],
+    known: KnownTags,
+) -> None:
+    if status[ACCEPTED]:
+        return
+    expected = "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in known.items())
+    where = f"{job.log.name}: in {frames[SEARCHED]} frames"
+    if seen:
+        names: dict[str, list[int]] = {}
+        for (family, number), _ in seen.most_common(40):
+            names.setdefault(family, []).append(number)
+        found = "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in sorted(names.items()))
+        raise DetectionError(
+            f"{where} only marker ids were seen that nothing describes: {found}; described are {expected}; "
+            "correct the ids or the family in machine.toml and site.toml"
+        )
+    others = {name: count for name, count in status.items() if name not in (ACCEPTED, UNKNOWN_ID)}
+    if others:
+        reasons = ", ".join(f"{name} {count}" for name, count in sorted(others.items()))
+        raise DetectionError(
+            f"{where} no marker could be accepted ({reasons}); described are {expected}; use larger or nearer markers, "
+            "or loosen detection.min_margin and detection.max_hamming in site.toml"
+        )
+    raise DetectionError(
+        f"{where} no marker was seen at all; described are {expected}; check the family, that the markers are in "
+        "view and at least 16 px wide, light and focus"
+    )
+
+
+def _ids(numbers: Sequence[int]) -> str:
+    shown = ", ".join(str(number) for number in numbers[:12])
+    return f"id{'s' if len(numbers) > 1 else ''} {shown}{', ...' if len(numbers) > 12 else ''}"
