@@ -193,21 +193,15 @@ def read_table(path: Path, name: str, columns: list[str] | None = None) -> dict[
     chosen = [column for column in schema.columns if columns is None or column.name in columns]
     assert columns is None or len(chosen) == len(set(columns)), (name, columns)
     try:
-        with pq.ParquetFile(
-            path,
-            read_dictionary=[column.name for column in chosen if column.type == "string"],
-            page_checksum_verification=True,
-        ) as file:
-            facts = file.schema_arrow.metadata or {}
-            found = (
-                facts.get(b"gradetrace.table", b"").decode(),
-                facts.get(b"gradetrace.version", b"").decode(),
+        facts = pq.read_schema(path).metadata or {}
+        found = (facts.get(b"gradetrace.table", b"").decode(), facts.get(b"gradetrace.version", b"").decode())
+        if found != (name, str(schema.version)):
+            raise ArtefactError(
+                f"{path} holds {found[0] or 'no'} table, version {found[1] or 'unknown'}; expected {name}, "
+                f"version {schema.version}; run 'gradetrace report' again to make it anew"
             )
-            if found != (name, str(schema.version)):
-                raise ArtefactError(
-                    f"{path} holds {found[0] or 'no'} table, version {found[1] or 'unknown'}; expected {name}, "
-                    f"version {schema.version}; run 'gradetrace report' again to make it anew"
-                )
+        words = [column.name for column in chosen if column.type == "string"]
+        with pq.ParquetFile(path, read_dictionary=words, page_checksum_verification=True) as file:
             table = file.read(columns=[column.name for column in chosen])
         return {column.name: _to_numpy(table[column.name], column) for column in chosen}
     except FileNotFoundError:
