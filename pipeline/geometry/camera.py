@@ -19,6 +19,7 @@ INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")  # px, px, p
 NEAREST_M = 1e-6  # a point closer than this to the plane of the lens counts as behind it
 
 _NEWTON_STEPS = 60
+_HALVINGS = 16
 _NEWTON_TOLERANCE = 1e-14
 _NEVER_FOLDS_ABOVE = 1e3  # normalised radius, 89.94 degrees off the axis
 
@@ -108,10 +109,8 @@ def project_with_jacobians(p_camera, intrinsics):
 def undistort(uv, intrinsics):
     """Normalised coordinates ``x/z, y/z`` of pixels: the ray through each, with ``z = 1``.
 
-    The radius is found first, between brackets, as if there were no tangential distortion; Newton steps in
-    both coordinates then settle the rest, never past ``fold_radius`` and halved while they do not help.
-    Newton straight from the distorted point gave up on one pixel in ten near the rim of lenses with
-    pincushion, and OpenCV's five fixed-point rounds are 0.4 px off at 45 degrees (f = 1000 px, k1 = -0.3).
+    Newton steps from the distorted point, never past ``fold_radius`` and halved while they do not help. OpenCV's
+    five fixed-point rounds are 0.4 px off at 45 degrees (f = 1000 px, k1 = -0.3).
 
     Parameters
     ----------
@@ -128,10 +127,10 @@ def undistort(uv, intrinsics):
     intrinsics = np.asarray(intrinsics, dtype=np.float64)
     target = (np.asarray(uv, dtype=np.float64) - intrinsics[..., 2:4]) / intrinsics[..., :2]
     limit = np.broadcast_to(fold_radius(intrinsics), target.shape[:-1])
-    # Not on the fold itself, where the slope vanishes and a step leads anywhere.
-    r_target = _norm(target)
-    r_start = np.minimum(_radius_before_distortion(r_target, intrinsics, limit), 0.99 * limit)
-    xy = target * (r_start / np.where(r_target > 0, r_target, 1.0))[..., None]
+    # Not from the fold itself, where the slope vanishes and a step leads anywhere: started there, one pixel in
+    # ten near the rim of lenses with pincushion was given up. A bracketed solve of the radius first, in three
+    # times the lines, saved one in 5,000 more, for lenses that nobody sells.
+    xy = _shorten(target, 0.9 * limit)
     residual, J = _residual(xy, target, intrinsics)
     for _ in range(_NEWTON_STEPS):
         step = _solve_2x2(J, residual)
@@ -139,7 +138,7 @@ def undistort(uv, intrinsics):
             break
         better = np.zeros(target.shape[:-1], dtype=bool)
         trial, trial_residual, trial_J = xy, residual, J
-        for halving in range(8):
+        for halving in range(_HALVINGS):
             candidate = _shorten(xy - step * 0.5**halving, limit)
             candidate_residual, candidate_J = _residual(candidate, target, intrinsics)
             now = ~better & (_norm(candidate_residual) < _norm(residual))
@@ -217,30 +216,6 @@ def _distort(xy, intrinsics, jacobian):
     J[..., 0, 1] = J[..., 1, 0] = mixed
     J[..., 1, 1] = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
     return xy_distorted, J
-
-
-def _radius_before_distortion(r_distorted, intrinsics, limit):
-    """``r`` with ``r radial(r) = r_distorted``, roughly, at most ``limit``; by bisection and Newton."""
-    k1, k2, k3 = (np.asarray(intrinsics, dtype=np.float64)[..., i] for i in (4, 5, 8))
-
-    def distorted(r):
-        s = r * r
-        value = r * (1 + s * (k1 + s * (k2 + s * k3)))
-        return value, 1 + s * (3 * k1 + s * (5 * k2 + s * 7 * k3))
-
-    low, high = np.zeros_like(r_distorted), np.minimum(limit, np.maximum(r_distorted, 1e-3))
-    for _ in range(12):
-        high = np.where(distorted(high)[0] < r_distorted, np.minimum(limit, 2 * high), high)
-    r = np.minimum(r_distorted, high)
-    for _ in range(30):
-        value, slope = distorted(r)
-        short = value < r_distorted
-        low, high = np.where(short, r, low), np.where(short, high, r)
-        if np.all(~(np.abs(value - r_distorted) > 1e-6)):
-            break
-        newton = r - (value - r_distorted) / np.where(slope > 1e-9, slope, 1e-9)
-        r = np.where((newton > low) & (newton < high), newton, 0.5 * (low + high))
-    return r
 
 
 def _residual(xy, target, intrinsics):

@@ -9,10 +9,10 @@
 The plane's x and y are those of the stick's frame as the caller lays it out, seen so that the bucket's
 angle is counter-clockwise about O. The bucket's own x axis is the direction at angle 0; ``horn_angle`` is
 that of O-H against it. Two circles meet twice, so the sizes alone allow eight assemblies. Excavators are
-built in one of two: rocker, coupler, horn and stick form a quadrilateral P E H O that is convex, with the
-cylinder on the outside of the rocker; ``side = +1`` if P E H O runs clockwise, ``-1`` for its mirror image.
-A longer cylinder turns the bucket clockwise for ``+1``, counter-clockwise for ``-1``. Leaving that
-quadrilateral means passing a dead centre, where the angle is no longer a function of the length: nan comes
+built in one of two: rocker, coupler, horn and stick form a quadrilateral P E H O that is convex at E and at
+H, with the cylinder on the outside of the rocker; ``side = +1`` if P E H O runs clockwise, ``-1`` for its
+mirror image. A longer cylinder turns the bucket clockwise for ``+1``, counter-clockwise for ``-1``. Leaving
+that shape means passing a dead centre, where the angle is no longer a function of the length: nan comes
 back there, and beyond the reach of the bars.
 """
 
@@ -193,7 +193,7 @@ def _solve_forward(length_m, params, side):
 
 
 def _as_built(A, P, E, H, side):
-    """Whether the pins lie as on a machine: cylinder behind the rocker, quadrilateral P E H O not folded."""
+    """Whether the pins lie as on a machine: cylinder outside the rocker, P E H O folded neither at E nor H."""
     return (side * _cross(A - P, E - P) < 0) & (side * _cross(E, H) < 0) & (side * _cross(H - P, E - P) > 0)
 
 

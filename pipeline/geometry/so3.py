@@ -22,7 +22,7 @@ def _cot_series():
     """Taylor coefficients of ``sqrt(u)/2 * coth(sqrt(u)/2)`` in ``u``: Bernoulli numbers ``B_2k / (2k)!``."""
     cosh = [Fraction(1, 4**k * factorial(2 * k)) for k in range(_TERMS)]
     sinhc = [Fraction(1, 4**k * factorial(2 * k + 1)) for k in range(_TERMS)]
-    series = []
+    series: list[Fraction] = []
     for k in range(_TERMS):
         series.append(cosh[k] - sum(series[j] * sinhc[k - j] for j in range(k)))
     return np.array([float(b) for b in series])
