@@ -1,0 +1,85 @@
+"""What `gradetrace sample-logs` makes: the committed sample, and drawn logs for benchmarks and tests."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from pipeline.errors import UsageError
+from pipeline.synthetic import recording, specification
+from pipeline.synthetic.cycle import CYCLE_S, TRAM_S
+from pipeline.synthetic.specification import Specification
+
+SIZES = {"640": (640, 480, 850.0), "1280": (1280, 960, 1731.0)}
+SAMPLE_SEED = 14
+FOLDER = Path("sample_logs")
+DRAWN = FOLDER / "generated"
+"""Where drawn logs go; not committed."""
+
+Progress = Callable[[int, int], None]
+
+
+def site(name: str = "trench", minutes: float | None = None, size: str = "640") -> Specification:
+    """The specification of a named site, of a wanted length and camera.
+
+    Raises UsageError.
+    """
+    if name not in specification.SITES:
+        raise UsageError(f"there is no site '{name}': known are {', '.join(specification.SITES)}")
+    spec = specification.SITES[name]()
+    if size not in SIZES:
+        raise UsageError(f"size '{size}' is not known: choose {' or '.join(SIZES)}")
+    if spec.size_free and size != "640":
+        # More pixels need a finer scale of blur and a better picture; the rest of the site is the same.
+        spec = replace(spec.scaled(*SIZES[size]), jpeg_quality=85)
+    if minutes is not None:
+        if not 0.3 <= minutes <= 600:
+            raise UsageError(f"the length must lie between 0.3 and 600 minutes, found {minutes:g}")
+        cycles = max(1, math.ceil((60 * minutes - 12) / (CYCLE_S * 1.015 + TRAM_S)))
+        spec = replace(spec, cycles=cycles)
+    return spec
+
+
+def make(
+    folder: Path | None = None,
+    site_name: str = "trench",
+    minutes: float | None = None,
+    size: str = "640",
+    seed: int = SAMPLE_SEED,
+    jobs: int = 2,
+    progress: Progress = lambda done, of: None,
+) -> Path:
+    """Record a synthetic site and return its log; the same arguments give the same bytes.
+
+    Parameters
+    ----------
+    folder
+        Left out: ``sample_logs/trench`` for the committed sample, else ``sample_logs/generated/<name>``.
+    site_name
+        ``trench`` or ``other``.
+    minutes
+        At least this long, in whole cycles; left out, the site's own four cycles.
+    size
+        ``640`` (640x480, f = 850 px) or ``1280`` (1280x960, f = 1731 px).
+    seed
+        Of every draw: motion, mounts, errors of calibration and survey, noise.
+    jobs
+        Processes that render.
+    progress
+        Called with frames written and frames in all.
+
+    Raises
+    ------
+    UsageError
+    """
+    spec = site(site_name, minutes, size)
+    if (site_name, minutes, size, seed) != ("trench", None, "640", SAMPLE_SEED):
+        length = "" if minutes is None else f"-{minutes:g}min"
+        pixels = f"-{size}" if spec.size_free else ""
+        spec = replace(spec, name=f"{site_name}{pixels}{length}-{seed}")
+        default = DRAWN / spec.name
+    else:
+        default = FOLDER / spec.name
+    return recording.record(spec, seed, default if folder is None else folder, jobs, progress)

@@ -1,0 +1,247 @@
+"""What a synthetic site is made of: dimensions, cameras, boards, sensors, sigmas, plan of the work.
+
+Lengths in metres, angles in degrees, as a person would write them down. Directions in the plan: a *station*
+runs along the alignment, an *offset* is positive to its left. The machine faces back along the alignment
+(towards lower stations), digs towards itself and retreats to higher stations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class CameraPlan:
+    """A camera on the cab."""
+
+    name: str
+    topic: str
+    position: tuple[float, float, float]
+    """In the cab frame: x forward along the arm, y left, z up from the ground."""
+    yaw_deg: float
+    """Direction it looks in, 0 along the arm, positive to the left."""
+    pitch_deg: float
+    """Positive looks up."""
+    roll_deg: float = 0.0
+    distortion: tuple[float, float, float, float, float] = (-0.14, 0.05, 0.0003, -0.0002, 0.0)
+    stamp_delay_ms: float = 0.0
+    """The cameras do not fire at the same instant."""
+
+
+@dataclass(frozen=True)
+class BoardPlan:
+    """A board of square tags, counted from the top left, row by row."""
+
+    name: str
+    first_id: int
+    rows: int
+    columns: int
+    tag_m: float
+    gap_m: float
+    margin_m: float = 0.05
+
+
+@dataclass(frozen=True)
+class BenchmarkPlan:
+    """A board on posts beside the trench."""
+
+    board: BoardPlan
+    station: float
+    """Relative to the middle of the machine's travel, plus towards higher stations."""
+    offset: float
+    height: float
+    """Of its centre above the ground."""
+    turn_deg: float = 0.0
+    """Turned away from facing the alignment squarely, about the vertical."""
+    lean_deg: float = 0.0
+    """Leaning back."""
+
+
+@dataclass(frozen=True)
+class SensorPlan:
+    """A sensor on the bucket joint."""
+
+    name: str
+    topic: str
+    kind: str
+    """``potentiometer`` (volts, cylinder length, four-bar linkage), ``encoder`` (radians in JointStates) or
+    ``card`` (counts of a rotary encoder card, own small message)."""
+    message: str
+    encoding: str
+    rate_hz: float = 20.0
+    noise: float = 0.0025
+    step: float = 5.0 / 4095.0
+    """Quantisation, raw unit."""
+    time_offset_s: float = 0.020
+    sigma_time_offset_s: float = 0.002
+    jitter_s: float = 0.0008
+
+
+@dataclass(frozen=True)
+class Sigmas:
+    """Standard deviations that the files state, and from which their errors are drawn."""
+
+    camera_mm: float = 2.0
+    camera_deg: float = 0.02
+    focal_px: float = 0.5
+    centre_px: float = 0.7
+    distortion: tuple[float, float, float, float, float] = (0.002, 0.006, 0.0001, 0.0001, 0.0)
+    benchmark_mm: float = 2.0
+    benchmark_deg: float = 0.05
+    marker_mm: float = 1.5
+    marker_deg: float = 0.03
+    axis_mm: float = 1.0
+    axis_deg: float = 0.03
+    linkage_mm: float = 0.3
+    horn_deg: float = 0.04
+    curve_zero: float = 0.0003
+    """Metres of cylinder, or degrees for a sensor of angle (times 200)."""
+    curve_scale: float = 0.00015
+    """Metres per volt; for a sensor of angle relative."""
+    tool_mm: float = 1.5
+    tool_deg: float = 0.1
+    shot_mm: float = 2.0
+
+
+@dataclass(frozen=True)
+class Arm:
+    """The planar arm: boom foot in the cab frame, lengths between pins, tip of the teeth."""
+
+    foot: tuple[float, float] = (0.35, 1.70)
+    """x and z of the boom foot in the cab frame."""
+    boom_m: float = 4.60
+    stick_m: float = 2.45
+    bucket_m: float = 1.25
+    """Bucket pin to the cutting edge."""
+    teeth_deg: float = -42.0
+    """Direction of the teeth against pin-to-edge, in the plane of the arm."""
+    width_m: float = 1.0
+    linkage: tuple[float, ...] = (-1.55, 0.30, -0.28, 0.0, 0.46, 0.40, 0.32, 130.0)
+    """Anchor x y, pivot x y, rocker, coupler, horn (m) and direction of the horn (deg)."""
+    linkage_side: int = 1
+
+
+@dataclass(frozen=True)
+class Trench:
+    """The design and what the operator makes of it."""
+
+    rows: tuple[tuple[float, float], ...]
+    """Station and elevation of the design floor, metres above the ground's datum (world z)."""
+    side_slope: float = 0.5
+    dug: tuple[tuple[float, float, float], ...] = ()
+    """Stretches deliberately dug off the design: from, to (stations relative to the first cut), deviation mm."""
+
+
+@dataclass(frozen=True)
+class Specification:
+    """One site, one machine, one job."""
+
+    name: str
+    title: str
+    machine_id: str
+    unit: str
+    origin: tuple[int, int, int]
+    """Grid unit."""
+    grid_name: str
+    start: tuple[float, float]
+    """First point of the alignment in the world, metres."""
+    bearing_deg: float
+    """Of the alignment, counter-clockwise from east."""
+    start_station: float
+    """Metres."""
+    length_m: float
+    ground: float
+    """World z of the ground, metres."""
+    trench: Trench
+    family: str
+    cameras: tuple[CameraPlan, ...]
+    benchmarks: tuple[BenchmarkPlan, ...]
+    stick_board: BoardPlan
+    stick_marker: tuple[float, float, float]
+    """Centre of the stick board in the stick frame."""
+    stick_marker_turn_deg: float
+    """Angle of its normal out of the plane of the arm, to the left."""
+    stick_marker_tilt_deg: float
+    """Of its normal in the plane of the arm, from the belly of the stick towards the boom."""
+    sensors: tuple[SensorPlan, ...]
+    width: int = 640
+    height: int = 480
+    focal: float = 850.0
+    rate_hz: float = 5.0
+    cycles: int = 4
+    step_m: float = 1.0
+    """Tramming between cycles."""
+    sweep_m: float = 2.9
+    """Length of one sweep of the edge along the floor."""
+    swing_deg: float = 58.0
+    first_station: float = 106.0
+    """Where the first sweep begins to cut."""
+    axis_reach: float = 6.75
+    """Distance of that point from the swing axis."""
+    start_utc_ns: int = 1_750_000_000_000_000_000
+    arm: Arm = Arm()
+    sigmas: Sigmas = Sigmas()
+    tolerance_mm: tuple[float, float] = (30.0, 30.0)
+    design_kind: str = "profile_csv"
+    noise: float = 1.2
+    """Standard deviation of the picture's noise at mid grey, grey levels."""
+    blur_px: float = 0.6
+    jpeg_quality: int = 75
+    sensor_note: str = ""
+    motion: dict[str, tuple[float, float]] = field(default_factory=dict)
+    """Spectral densities of white-noise acceleration by body, for machine.toml."""
+    size_free: bool = True
+    """Whether its cameras may be had with other numbers of pixels."""
+
+    def scaled(self, width: int, height: int, focal: float) -> Specification:
+        """The same site seen by cameras of another size."""
+        return replace(self, width=width, height=height, focal=focal)
+
+
+def trench() -> Specification:
+    """The committed sample: the paper's prototype of Fig. 1 with its 640x480, f = 850 px cameras."""
+    return Specification(
+        name="trench",
+        title="Storm drain, lot 2",
+        machine_id="ex-14",
+        unit="m",
+        origin=(356100, 5812400, 34),
+        grid_name="UTM 33N (EPSG:25833), heights DHHN2016",
+        start=(31.0, 24.0),
+        bearing_deg=28.0,
+        start_station=100.0,
+        length_m=30.0,
+        ground=2.25,
+        trench=Trench(
+            rows=((100.0, 0.850), (108.0, 0.810), (114.0, 0.750), (130.0, 0.670)),
+            dug=((0.9, 1.9, 50.0), (2.9, 3.9, -45.0), (4.6, 5.2, 27.0)),
+        ),
+        family="tag36h11",
+        cameras=(
+            CameraPlan("bench", "/cab/bench/image", (0.55, 0.80, 2.45), -92.6, -4.0, stamp_delay_ms=0.0),
+            CameraPlan(
+                "arm",
+                "/cab/arm/image",
+                (0.70, 0.95, 2.30),
+                -4.0,
+                -5.5,
+                distortion=(-0.17, 0.06, -0.0002, 0.0003, 0.0),
+                stamp_delay_ms=7.3,
+            ),
+        ),
+        benchmarks=(
+            BenchmarkPlan(BoardPlan("bm-near", 10, 2, 2, 0.34, 0.07), 0.1, 6.2, 1.05, 12.0, 6.0),
+            BenchmarkPlan(BoardPlan("bm-west", 20, 2, 2, 0.45, 0.08), -1.75, 9.4, 3.4, -18.0, 0.0),
+            BenchmarkPlan(BoardPlan("bm-east", 30, 2, 2, 0.45, 0.08), 1.75, 9.9, 1.9, 14.0, 2.0),
+        ),
+        stick_board=BoardPlan("stick-board", 1, 2, 2, 0.26, 0.06, 0.04),
+        stick_marker=(0.75, 0.05, -0.55),
+        stick_marker_turn_deg=40.0,
+        stick_marker_tilt_deg=18.0,
+        sensors=(
+            SensorPlan("bucket-pot", "/bucket/potentiometer", "potentiometer", "sensor_sample", "protobuf"),
+        ),
+    )
+
+
+SITES = {"trench": trench}
