@@ -190,13 +190,20 @@ class LogReader:
                 picture.height,
             )
 
-    def samples(self, sensors: Mapping[str, tuple[str, str]]) -> Iterator[Sample]:
+    def samples(
+        self,
+        sensors: Mapping[str, tuple[str, str]],
+        start_ns: int | None = None,
+        end_ns: int | None = None,
+    ) -> Iterator[Sample]:
         """Readings of some sensors, in the order of the file.
 
         Parameters
         ----------
         sensors
             Sensor name -> (topic, field); for joint states the field is the joint's name.
+        start_ns, end_ns : int or None
+            Only messages *received* in ``[start_ns, end_ns)``.
 
         Raises
         ------
@@ -209,7 +216,7 @@ class LogReader:
                 decode = reading_decoder(self._channel(number), field)
                 assert decode is not None
                 wanted.setdefault(number, []).append((sensor, topic, decode))
-        for number, log_time_ns, payload in self._messages(frozenset(wanted)):
+        for number, log_time_ns, payload in self._messages(frozenset(wanted), start_ns, end_ns):
             for sensor, topic, decode in wanted[number]:
                 try:
                     time_ns, raw = decode(payload)
