@@ -278,8 +278,8 @@ def _clock_findings(machine: Machine, seen: Seen) -> Iterator[Finding]:
                 amiss = True
                 yield Finding(
                     "warning",
-                    f"{kind} '{name}': the stamps of {len(time_ns)} messages looked at run backwards {backwards} times; "
-                    "they are sorted, but a clock that is set while it records spoils the motion: set it before",
+                    f"{kind} '{name}': the stamps of {len(time_ns)} messages looked at run backwards {backwards} "
+                    "times; they are sorted, but a clock that is set while it records spoils the motion: set it before",
                 )
             if (unset := int(np.sum(time_ns <= 0))) > 0:
                 amiss = True
