@@ -1,0 +1,195 @@
+"""What needs attention: warnings of all stages and findings of the page itself, the gravest first."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.report.evidence import MOVED_SIGMAS, Timeline
+from pipeline.report.facts import deviation_text, station_text
+from pipeline.report.inputs import ReportInputs
+from pipeline.report.numbers import Number, duration_text
+from pipeline.report.units import Units, text_of
+from pipeline.report.words import Words
+
+SHOWN = 5
+GRAVE, SERIOUS, WORTH = 0, 1, 2
+"""Order of the list: the verdict rests on it; part of the answer is missing; worth a look."""
+CHECK_OFF_SIGMAS = 3.0
+CHI_SQUARE_HIGH = 2.0
+BRIDGED_WORTH_S = 5.0
+
+SECTION_OF_STAGE = {
+    "ingest": "coverage",
+    "detect": "coverage",
+    "estimate": "quality",
+    "track": "coverage",
+    "survey": "stations",
+}
+
+
+@dataclass(frozen=True)
+class Remark:
+    """One sentence and the section it is about."""
+
+    grade: int
+    sentence: str
+    section: str
+
+
+def attention(
+    inputs: ReportInputs,
+    units: Units,
+    words: Words,
+    timeline: Timeline | None,
+    statistics: dict[str, Number] | None,
+) -> dict[str, Any]:
+    """At most five remarks, and the rest, which is folded away but never dropped."""
+    remarks = [
+        *_of_log(inputs, words),
+        *_of_stations(inputs, units, words),
+        *_of_checks(inputs, words, statistics),
+        *_of_network(inputs, words),
+        *_of_coverage(inputs, words, timeline),
+        *(
+            Remark(SERIOUS, words("attention.missing", artefact=k, why=v), "provenance")
+            for k, v in inputs.missing.items()
+        ),
+        *_warnings(inputs),
+    ]
+    seen: dict[str, Remark] = {}
+    for remark in sorted(remarks, key=lambda r: r.grade):  # stable: the order above within a grade
+        seen.setdefault(remark.sentence, remark)
+    listed = [
+        {"sentence": r.sentence, "section": r.section, "heading": words(f"sections.{r.section}")}
+        for r in seen.values()
+    ]
+    return {"items": listed[:SHOWN], "more": listed[SHOWN:]}
+
+
+def _warnings(inputs: ReportInputs) -> list[Remark]:
+    remarks = []
+    told = (inputs.log_facts.get("recovery") or {}).get(
+        "sentence"
+    )  # the list has it already, with the seconds
+    for stage, manifest in inputs.manifests.items():
+        for sentence in manifest.get("warnings") or ():
+            if sentence == told:
+                continue
+            remarks.append(Remark(SERIOUS, str(sentence), SECTION_OF_STAGE.get(stage, "provenance")))
+    for facts, section in (
+        (inputs.solution, "quality"),
+        (inputs.survey, "stations"),
+        (inputs.log_facts, "coverage"),
+    ):
+        for sentence in facts.get("warnings") or ():
+            remarks.append(Remark(SERIOUS, str(sentence), section))
+    return remarks
+
+
+def _of_log(inputs: ReportInputs, words: Words) -> list[Remark]:
+    recovery = inputs.log_facts.get("recovery") or {}
+    if recovery.get("complete", True):
+        return []
+    seconds = recovery.get("lost_seconds")
+    said = duration_text(seconds) if seconds is not None else words("page.unknown")
+    sentence = str(recovery.get("sentence") or "")
+    return [Remark(GRAVE, words("attention.lost", seconds=said, sentence=sentence).strip(), "coverage")]
+
+
+def _of_stations(inputs: ReportInputs, units: Units, words: Words) -> list[Remark]:
+    stations = inputs.table("stations")
+    if stations is None:
+        return []
+    verdict, deviation, u = stations["verdict"], stations["deviation"], stations["expanded_uncertainty"]
+    remarks = []
+    failed = np.flatnonzero(verdict == "FAIL")
+    if len(failed):
+        worst = failed[np.argmax(np.abs(deviation[failed]))]
+        sentence = words(
+            "attention.fail",
+            n=len(failed),
+            all=len(verdict),
+            station=station_text(stations["station"][worst], units),
+            deviation=deviation_text(deviation[worst], units),
+            u=deviation_text(u[worst], units, signed=False),
+            side=words("summary.high" if deviation[worst] > 0 else "summary.low"),
+        )
+        remarks.append(Remark(GRAVE, sentence, "stations"))
+    # U = k sigma against the wider half of the tolerance's width: beyond it no deviation at all could pass.
+    incapable = np.flatnonzero(u > (inputs.site.tolerance.high_mm + inputs.site.tolerance.low_mm) / 2000)
+    if len(incapable):
+        sentence = words(
+            "attention.not_capable",
+            n=len(incapable),
+            u=deviation_text(float(np.median(u[incapable])), units, signed=False),
+        )
+        remarks.append(Remark(GRAVE, sentence, "error_budget"))
+    if unsure := int((verdict == "CANNOT TELL").sum()):
+        remarks.append(Remark(SERIOUS, words("attention.cannot_tell", n=unsure), "stations"))
+    gone = np.flatnonzero(verdict == "NOT REACHED")
+    if len(gone):
+        first, last = (station_text(stations["station"][i], units) for i in (gone[0], gone[-1]))
+        sentence = words("attention.not_reached", n=len(gone), first=first, last=last)
+        remarks.append(Remark(SERIOUS, sentence, "stations"))
+    if partly := int((stations["state"] == "partly cut").sum()):
+        remarks.append(Remark(WORTH, words("attention.partly", n=partly), "stations"))
+    return remarks
+
+
+def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number] | None) -> list[Remark]:
+    checks = inputs.table("checks")
+    if statistics is None or checks is None:
+        return [Remark(SERIOUS, words("attention.no_checks"), "checks")]
+    remarks = []
+    z = checks["z"][np.isfinite(checks["z"])]
+    if off := int((np.abs(z) > CHECK_OFF_SIGMAS).sum()):
+        remarks.append(Remark(GRAVE, words("attention.check_off", n=off), "checks"))
+    value = statistics["reduced_chi_square"]["value"]
+    if value is not None and value > CHI_SQUARE_HIGH:
+        remarks.append(Remark(SERIOUS, words("attention.chi_square", value=text_of(value, 2)), "checks"))
+    return remarks
+
+
+def _of_network(inputs: ReportInputs, words: Words) -> list[Remark]:
+    remarks = []
+    residuals = inputs.table("residuals")
+    if residuals is not None:
+        unseen = sorted(
+            set(inputs.site.benchmarks) - set(np.unique(residuals["marker"].astype(str)).tolist())
+        )
+        if unseen:
+            sentence = words("attention.benchmark_unseen", names=", ".join(unseen))
+            remarks.append(Remark(SERIOUS, sentence, "quality"))
+    statics = inputs.table("statics")
+    if statics is not None:
+        shift = np.nan_to_num(statics["shift_sigmas"])
+        for i in np.argsort(-np.abs(shift), kind="stable"):
+            if abs(shift[i]) <= MOVED_SIGMAS:
+                break
+            sentence = words(
+                "attention.static_moved",
+                quantity=statics["quantity"][i],
+                component=statics["component"][i],
+                sigmas=text_of(float(shift[i]), 1, signed=True),
+            )
+            remarks.append(Remark(WORTH, sentence, "statics"))
+    return remarks
+
+
+def _of_coverage(inputs: ReportInputs, words: Words, timeline: Timeline | None) -> list[Remark]:
+    if timeline is None:
+        return []
+    remarks = []
+    silent = [camera for camera, tags in timeline.accepted.items() if tags.sum() == 0]
+    if silent:
+        sentence = words("attention.camera_silent", names=", ".join(silent))
+        remarks.append(Remark(SERIOUS, sentence, "coverage"))
+    if timeline.bridged_s > BRIDGED_WORTH_S:
+        sentence = words(
+            "attention.bridged", seconds=duration_text(timeline.bridged_s), n=len(timeline.gaps_ns)
+        )
+        remarks.append(Remark(WORTH, sentence, "coverage"))
+    return remarks

@@ -1,0 +1,307 @@
+"""What the answer rests on, as tables: error budget, coverage over time, residuals, calibrated quantities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from pipeline.report import numbers
+from pipeline.report.facts import span_ns
+from pipeline.report.inputs import ReportInputs
+from pipeline.report.numbers import column, number
+from pipeline.report.units import Units
+from pipeline.report.words import Words
+
+MAX_BINS = 240
+MAX_TABLE_BINS = 40
+MAX_GAPS = 20
+STATICS_SHOWN = 10
+MOVED_SIGMAS = 3.0
+"""A static that the log moved further than this, in its own prior sigmas, is worth a look."""
+FAR = 3.0
+"""Length of a whitened corner residual, of two components, that 1 in 90 corners passes by chance."""
+HISTOGRAM_EDGES = np.arange(0.0, 5.01, 0.25)
+
+
+@dataclass(frozen=True)
+class Timeline:
+    """Tags seen and gaps over the log."""
+
+    edges_s: np.ndarray
+    """(n + 1,) seconds from the start of the log."""
+    frames: dict[str, np.ndarray]
+    """Camera -> (n,) frames per bin."""
+    accepted: dict[str, np.ndarray]
+    """Camera -> (n,) accepted tags per bin."""
+    gaps_ns: np.ndarray
+    """(g, 2) spans in which the cutting edge was not observed."""
+    start_ns: int
+
+    @property
+    def bridged_s(self) -> float:
+        """Seconds of all gaps."""
+        return float((self.gaps_ns[:, 1] - self.gaps_ns[:, 0]).sum() / 1e9)
+
+
+def gaps_of(time_ns: np.ndarray, seen: np.ndarray) -> np.ndarray:
+    """(g, 2) spans from the last observed instant to the next one, in nanoseconds."""
+    order = np.argsort(time_ns, kind="stable")
+    time_ns, seen = time_ns[order], seen[order].astype(bool)
+    change = np.diff(np.concatenate([[True], seen, [True]]).astype(np.int8))
+    starts, ends = np.flatnonzero(change == -1), np.flatnonzero(change == 1)
+    starts, ends = np.maximum(starts - 1, 0), np.minimum(ends, len(time_ns) - 1)
+    return np.stack([time_ns[starts], time_ns[ends]], axis=1).reshape(-1, 2)
+
+
+def timeline_of(inputs: ReportInputs, bins: int = MAX_BINS) -> Timeline | None:
+    """The timeline in at most `bins` equal bins of at least a second, or None without frames."""
+    frames, span = inputs.table("frames"), span_ns(inputs)
+    if frames is None or span is None:
+        return None
+    start, end = span
+    seconds = max((end - start) / 1e9, 1e-3)
+    edges = np.linspace(0.0, seconds, max(1, min(bins, int(seconds))) + 1)
+    seen_frames, accepted = {}, {}
+    for camera in inputs.machine.cameras:
+        own = frames["camera"] == camera
+        seen_frames[camera] = _count((frames["time_ns"][own] - start) / 1e9, edges)
+        found = inputs.detections.get(camera)
+        times = found["time_ns"][found["status"] == "accepted"] if found else np.zeros(0, np.int64)
+        accepted[camera] = _count((times - start) / 1e9, edges)
+    edge = inputs.table("cutting_edge")
+    gaps = np.zeros((0, 2), np.int64)
+    if edge is not None:
+        middle = edge["point"] == "middle"
+        gaps = gaps_of(edge["time_ns"][middle], edge["seen"][middle])
+    return Timeline(edges, seen_frames, accepted, gaps, start)
+
+
+def _count(seconds: np.ndarray, edges: np.ndarray) -> np.ndarray:
+    return np.histogram(np.clip(seconds, edges[0], edges[-1]), edges)[0]
+
+
+def coverage(inputs: ReportInputs, words: Words) -> dict[str, Any]:
+    """Tables of the coverage section: by camera, by reason of rejection, gaps, over time."""
+    per_camera, per_reason = [], []
+    frames = inputs.table("frames")
+    for camera in inputs.machine.cameras:
+        count = 0 if frames is None else int((frames["camera"] == camera).sum())
+        found = inputs.detections.get(camera)
+        status = found["status"] if found else np.zeros(0, object)
+        good = status == "accepted"
+        with_tag = len(np.unique(found["time_ns"][good])) if found else 0
+        per_camera.append(
+            {
+                "camera": camera,
+                "frames": count,
+                "frames_with": with_tag,
+                "share": 100.0 * with_tag / count if count else None,
+                "accepted": int(good.sum()),
+                "rejected": int((~good).sum()),
+            }
+        )
+        for reason, number_ in zip(*np.unique(status[~good].astype(str), return_counts=True)):
+            per_reason.append({"camera": camera, "status": str(reason), "count": int(number_)})
+    cameras = [
+        column("camera", words("columns.camera")),
+        column("frames", words("columns.frames"), "", 0),
+        column("frames_with", words("columns.frames_with"), "", 0),
+        column("share", words("columns.frames_with"), "%", 1),
+        column("accepted", words("columns.accepted"), "", 0),
+        column("rejected", words("columns.rejected"), "", 0),
+    ]
+    reasons = [
+        column("camera", words("columns.camera")),
+        column("status", words("columns.status")),
+        column("count", words("columns.count"), "", 0),
+    ]
+    return {
+        "cameras": numbers.table(cameras, per_camera),
+        "reasons": numbers.table(reasons, sorted(per_reason, key=lambda r: (r["camera"], -r["count"]))),
+        **_gaps_and_time(inputs, words),
+    }
+
+
+def _gaps_and_time(inputs: ReportInputs, words: Words) -> dict[str, Any]:
+    coarse = timeline_of(inputs, MAX_TABLE_BINS)
+    if coarse is None:
+        return {"gaps": None, "gap_count": None, "bridged": None, "time": None}
+    longest = sorted(coarse.gaps_ns.tolist(), key=lambda gap: gap[0] - gap[1])[:MAX_GAPS]
+    gap_rows = [
+        {
+            "start": numbers.utc_text(start, 1)[11:-4],
+            "end": numbers.utc_text(end, 1)[11:-4],
+            "seconds": (end - start) / 1e9,
+        }
+        for start, end in sorted(longest)
+    ]
+    columns = [column("start", words("columns.start"))]
+    rows: list[dict[str, Any]] = [
+        {"start": numbers.utc_text(coarse.start_ns + int(t * 1e9))[11:-4]} for t in coarse.edges_s[:-1]
+    ]
+    for i, camera in enumerate(coarse.frames):
+        columns.append(column(f"frames_{i}", f"{camera}: {words('columns.frames')}", "", 0))
+        columns.append(column(f"tags_{i}", f"{camera}: {words('columns.tags_per_frame')}", "", 2))
+        for row, count, tags in zip(rows, coarse.frames[camera], coarse.accepted[camera]):
+            row[f"frames_{i}"] = int(count)
+            row[f"tags_{i}"] = tags / count if count else None
+    gap_columns = [
+        column("start", words("columns.start")),
+        column("end", words("columns.end")),
+        column("seconds", words("columns.seconds"), "s", 1),
+    ]
+    return {
+        "gaps": numbers.table(gap_columns, gap_rows),
+        "gap_count": number(len(coarse.gaps_ns)),
+        "bridged": number(coarse.bridged_s, "s", 1),
+        "time": numbers.table(columns, rows),
+    }
+
+
+def residual_histogram(inputs: ReportInputs) -> tuple[np.ndarray, np.ndarray] | None:
+    """Observed and expected share per bin of HISTOGRAM_EDGES (the last bin takes all beyond), in per cent.
+
+    The length of a whitened residual with two components is Rayleigh distributed: P(> r) = exp(-r²/2).
+    """
+    residuals = inputs.table("residuals")
+    if residuals is None:
+        return None
+    found = np.histogram(np.minimum(residuals["normalised"], HISTOGRAM_EDGES[-1] - 1e-9), HISTOGRAM_EDGES)[0]
+    survival = np.exp(-0.5 * HISTOGRAM_EDGES**2)
+    survival[-1] = 0.0
+    return 100.0 * found / found.sum(), -100.0 * np.diff(survival)
+
+
+def quality(inputs: ReportInputs, words: Words) -> dict[str, Any]:
+    """Figures of the internal consistency: a few numbers, a table by marker, the histogram's data."""
+    residuals = inputs.table("residuals")
+    figures: list[tuple[str, numbers.Number]] = []
+    test = inputs.solution.get("global_test") or {}
+    figures += [
+        ("sigma0_squared", number(test.get("sigma0_squared"), "", 2)),
+        ("redundancy", number(test.get("redundancy"), "", 0)),
+        ("iterations", number(inputs.solution.get("iterations"), "", 0)),
+    ]
+    if residuals is None:
+        return {"numbers": _labelled(figures, words), "test": "", "markers": None, "histogram": None}
+    length, weight = residuals["normalised"], residuals["weight"]
+    figures += [
+        ("corners", number(len(length))),
+        ("rms", number(float(np.sqrt(np.mean(length**2) / 2)), "", 2)),
+        ("beyond", number(100.0 * float(np.mean(length > FAR)), "%", 1)),
+        ("downweighted", number(100.0 * float(np.mean(weight < 0.5)), "%", 1)),
+    ]
+    columns = [
+        column("marker", words("columns.marker")),
+        column("camera", words("columns.camera")),
+        column("corners", words("columns.corners"), "", 0),
+        column("rms_px", words("columns.rms_px"), "px", 3),
+        column("mean_square", words("columns.mean_square"), "", 2),
+        column("beyond", words("columns.beyond"), "%", 1),
+        column("downweighted", words("columns.downweighted"), "%", 1),
+    ]
+    rows = []
+    markers, at_marker = np.unique(residuals["marker"].astype(str), return_inverse=True)
+    cameras, at_camera = np.unique(residuals["camera"].astype(str), return_inverse=True)
+    pairs = at_marker * len(cameras) + at_camera
+    for pair in np.unique(pairs):
+        own = pairs == pair
+        marker, camera = str(markers[pair // len(cameras)]), str(cameras[pair % len(cameras)])
+        square = residuals["residual_u"][own] ** 2 + residuals["residual_v"][own] ** 2
+        rows.append(
+            {
+                "marker": marker,
+                "camera": camera,
+                "corners": int(own.sum()),
+                "rms_px": float(np.sqrt(square.mean() / 2)),
+                "mean_square": float(np.sqrt(np.mean(length[own] ** 2) / 2)),
+                "beyond": 100.0 * float(np.mean(length[own] > FAR)),
+                "downweighted": 100.0 * float(np.mean(weight[own] < 0.5)),
+            }
+        )
+    observed, expected = residual_histogram(inputs) or (np.zeros(0), np.zeros(0))
+    bins = [
+        column("bin", words("columns.bin")),
+        column("observed", words("columns.observed"), "%", 1),
+        column("expected", words("columns.expected"), "%", 1),
+    ]
+    last = len(observed) - 1
+    names = [
+        f"{low:.2f} to {high:.2f}" if i < last else f"{low:.2f} and more"
+        for i, (low, high) in enumerate(zip(HISTOGRAM_EDGES[:-1], HISTOGRAM_EDGES[1:]))
+    ]
+    histogram = numbers.records({"bin": names, "observed": observed, "expected": expected})
+    return {
+        "numbers": _labelled(figures, words),
+        "test": _global_test(inputs, words),
+        "markers": numbers.table(columns, rows),
+        "histogram": numbers.table(bins, histogram),
+    }
+
+
+def _global_test(inputs: ReportInputs, words: Words) -> str:
+    """The global test in words, or an empty string where the adjustment made none."""
+    test = inputs.solution.get("global_test") or {}
+    if test.get("passed") is None or not test.get("bounds_95"):
+        return ""
+    low, high = (f"{bound:.3f}" for bound in test["bounds_95"])
+    return words("quality.passed_yes" if test["passed"] else "quality.passed_no", low=low, high=high)
+
+
+def _labelled(figures: list[tuple[str, numbers.Number]], words: Words) -> list[dict[str, Any]]:
+    return [{"key": key, "label": words(f"quality.{key}"), "number": value} for key, value in figures]
+
+
+def error_budget(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any] | None:
+    """Standard deviation of the cutting edge's elevation by source, the largest first, and their whole."""
+    parts = budget_parts(inputs)
+    if not parts:
+        return None
+    total = sum(sigma**2 for _, sigma in parts)
+    columns = [
+        column("source", words("columns.source")),
+        column("sigma", words("columns.sigma"), units.deviation, units.fine_digits),
+        column("share", words("columns.share"), "%", 0),
+    ]
+    rows = [
+        {
+            "source": source,
+            "sigma": units.to_deviation(sigma),
+            "share": 100 * sigma**2 / total if total else None,
+        }
+        for source, sigma in parts
+    ]
+    return numbers.table(columns, rows)
+
+
+def budget_parts(inputs: ReportInputs) -> list[tuple[str, float]]:
+    """Source and sigma in metres, the largest first."""
+    found = (inputs.solution.get("error_budget") or {}).get("sources_mm") or {}
+    parts = [(str(source), float(mm) / 1000) for source, mm in found.items() if mm is not None]
+    return sorted(parts, key=lambda part: (-part[1], part[0]))
+
+
+def statics(inputs: ReportInputs, words: Words) -> dict[str, Any]:
+    """All statics, the most moved first, in the unit that the table states; ten in sight, the rest folded away."""
+    found = inputs.table("statics")
+    if found is None:
+        return {"statics": None, "statics_rest": None}
+    columns = [
+        column("quantity", words("columns.quantity"), kind="name"),
+        column("component", words("columns.component")),
+        column("source", words("columns.source")),
+        column("file_value", words("columns.file_value"), "", 6, signed=False),
+        column("value", words("columns.value"), "", 6),
+        column("unit", words("columns.unit")),
+        column("prior_sigma", words("columns.prior_sigma"), "", 6),
+        column("sigma", words("columns.sigma"), "", 6),
+        column("shift", words("columns.shift"), "", 2, signed=True),
+    ]
+    order = np.argsort(-np.abs(np.nan_to_num(found["shift_sigmas"])), kind="stable")
+    names = ("quantity", "component", "source", "file_value", "value", "unit", "prior_sigma", "sigma")
+    shown = {name: found[name][order] for name in names} | {"shift": found["shift_sigmas"][order]}
+    rows = numbers.records(shown)
+    rest = numbers.table(columns, rows[STATICS_SHOWN:]) if len(rows) > STATICS_SHOWN else None
+    return {"statics": numbers.table(columns, rows[:STATICS_SHOWN]), "statics_rest": rest}

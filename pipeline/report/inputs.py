@@ -1,0 +1,73 @@
+"""What a page is made of: the artefacts of one run, read whole, and why some of them are not there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import Machine, Site
+from pipeline.surface.alignment import Alignment
+
+Table = Mapping[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class FileSource:
+    """A file the run rests on."""
+
+    name: str
+    origin: str
+    """Where it came from: a path as the user wrote it, or ``attachment of the log``."""
+    sha256: str
+
+
+@dataclass(frozen=True)
+class ReportInputs:
+    """One run's artefacts. Tables are column name -> array, in metres, radians and nanoseconds."""
+
+    machine: Machine
+    site: Site
+    log: FileSource
+    machine_file: FileSource
+    site_file: FileSource
+    named_files: Mapping[str, FileSource] = field(default_factory=dict)
+    """Files that site.toml names: ``design``, ``checks``."""
+    alignment: Alignment | None = None
+    """The line that stations run along, grid metres."""
+    tables: Mapping[str, Table] = field(default_factory=dict)
+    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, checks."""
+    detections: Mapping[str, Table] = field(default_factory=dict)
+    """By camera; columns time_ns, tag_id and status."""
+    log_facts: Mapping[str, Any] = field(default_factory=dict)
+    """log.json."""
+    solution: Mapping[str, Any] = field(default_factory=dict)
+    """solution.json."""
+    survey: Mapping[str, Any] = field(default_factory=dict)
+    """survey.json."""
+    manifests: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """By stage, in the order of the stages."""
+    missing: Mapping[str, str] = field(default_factory=dict)
+    """Artefact -> why it is not there, one sentence."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """gradetrace, python and libraries -> version."""
+
+    def table(self, name: str) -> Table | None:
+        """A table with at least one row, or None."""
+        found = self.tables.get(name)
+        return found if found is not None and rows_of(found) else None
+
+    def why_missing(self, name: str) -> str:
+        """One sentence for the page where an artefact has nothing to show."""
+        if name in self.missing:
+            return self.missing[name]
+        return (
+            f"the table {name} has no rows" if name in self.tables else f"{name} was not written by this run"
+        )
+
+
+def rows_of(table: Table) -> int:
+    """Rows of a table."""
+    return len(next(iter(table.values()))) if table else 0

@@ -1,0 +1,311 @@
+"""Figures seen from above: the plan, and the deviation map by station and offset."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize, to_rgba
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+
+from pipeline.report import numbers, palette
+from pipeline.report.drawing import DEVIATION_MAP, WIDTH_IN, new_figure
+from pipeline.report.inputs import ReportInputs
+from pipeline.report.measured import Grid
+from pipeline.report.numbers import column
+from pipeline.report.units import Units, text_of
+from pipeline.report.words import Words
+from pipeline.surface.alignment import Alignment
+
+MAX_PLAN_COLUMNS = 1500
+MAX_MAP_COLUMNS = 1500
+
+
+def drawn_line(line: Alignment) -> np.ndarray:
+    """(n, 2) points of the alignment close enough together to draw its arcs, grid metres."""
+    middle = np.linspace(line.start_station, line.end_station, 400)
+    return line.points(np.unique(np.concatenate([middle, line.station])), 0.0)
+
+
+def scale_of(inputs: ReportInputs, grid: Grid) -> float:
+    """Largest deviation of the colour scale in metres: twice the wider tolerance, more where cells need it."""
+    tolerance = 2 * max(inputs.site.tolerance.high_mm, inputs.site.tolerance.low_mm, 1.0) / 1000
+    known = np.abs(grid.values["deviation"][np.isfinite(grid.values["deviation"])])
+    spread = float(np.quantile(known, 0.95)) if len(known) else 0.0
+    return tolerance if spread <= tolerance else spread
+
+
+def benchmarks_en(inputs: ReportInputs) -> dict[str, np.ndarray]:
+    """Benchmark -> easting and northing, grid metres."""
+    scale = inputs.site.grid.metres_per_unit
+    found = {}
+    for name, mark in inputs.site.benchmarks.items():
+        enh = [mark.pose.enh] if mark.pose else [corner.enh for corner in mark.corners]
+        found[name] = np.mean(np.array(enh, float), axis=0)[:2] * scale
+    return found
+
+
+def points_table(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any]:
+    """Benchmarks and check shots of the plan with their coordinates."""
+    columns = [
+        column("point", words("columns.point"), kind="name"),
+        column("what", words("columns.what")),
+        column("e", words("columns.e"), units.length, units.length_digits),
+        column("n", words("columns.n"), units.length, units.length_digits),
+    ]
+    rows = [
+        {
+            "point": name,
+            "what": words("plan.benchmark"),
+            "e": units.to_length(en[0]),
+            "n": units.to_length(en[1]),
+        }
+        for name, en in benchmarks_en(inputs).items()
+    ]
+    if (checks := inputs.table("checks")) is not None:
+        rows += [
+            {"point": name, "what": words("plan.check"), "e": units.to_length(e), "n": units.to_length(n)}
+            for name, e, n in zip(checks["point"], checks["e"], checks["n"])
+        ]
+    return numbers.table(columns, rows)
+
+
+def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Figure:
+    """North up and to scale: alignment, design outline, cells by deviation, check shots, benchmarks."""
+    marks = benchmarks_en(inputs)
+    checks = inputs.table("checks")
+    outline, centre = _outline(grid, line), drawn_line(line)
+    corners = [centre, *outline, *(mark[None] for mark in marks.values())]
+    if checks is not None:
+        corners.append(np.stack([checks["e"], checks["n"]], axis=1))
+    everything = np.concatenate(corners)
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    size = np.maximum(high - low, 1.0) * 1.12
+    figure = new_figure(float(np.clip(WIDTH_IN * 0.82 * size[1] / size[0] + 0.9, 2.6, 6.2)))
+    ax = figure.subplots()
+    # Plotted from a near corner: float32 in the renderer would cut seven-digit northings into steps.
+    origin = np.floor(low)
+    reach = scale_of(inputs, grid)
+    norm = Normalize(-float(units.to_deviation(reach)), float(units.to_deviation(reach)))
+    _cells(ax, grid, line, origin, norm, units)
+    for part in outline:
+        ax.add_patch(Polygon((part - origin) * units.per_metre, fill=False, ec=palette.DESIGN, lw=0.6))
+    at = (centre - origin) * units.per_metre
+    ax.plot(*at.T, color=palette.DESIGN, lw=0.7, ls=(0, (8, 2, 2, 2)))
+    _station_marks(ax, line, origin, grid, units)
+    if checks is not None:
+        e, n = ((np.asarray(checks[k], float) - o) * units.per_metre for k, o in zip("en", origin))
+        ax.plot(e, n, "D", ms=3.4, mfc="white", mec=palette.CHECK, mew=0.9, ls="", label="check shot")
+    for i, (name, en) in enumerate(marks.items()):
+        e, n = (en - origin) * units.per_metre
+        ax.plot(e, n, "^", ms=6, color=palette.INK, ls="", label="benchmark" if i == 0 else None)
+        ax.annotate(name, (e, n), (0, 5), textcoords="offset points", ha="center", fontsize=7)
+    middle = ((low + high) / 2 - origin) * units.per_metre
+    span = size * units.per_metre
+    ax.set_xlim(middle[0] - span[0] / 2, middle[0] + span[0] / 2)
+    ax.set_ylim(middle[1] - span[1] / 2, middle[1] + span[1] / 2)
+    ax.set_aspect("equal", adjustable="datalim")
+    for axis, start in ((ax.xaxis, origin[0]), (ax.yaxis, origin[1])):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(
+            FuncFormatter(lambda value, _, start=start: text_of(value + start * units.per_metre, 1))
+        )
+    ax.set_xlabel(f"Easting [{units.length}]")
+    ax.set_ylabel(f"Northing [{units.length}]")
+    for spine in ax.spines.values():
+        spine.set_visible(True)
+    handles = [
+        Patch(fc=palette.PAPER, ec=palette.DESIGN, lw=0.6, label="design"),
+        ax.plot([], [], color=palette.DESIGN, lw=0.7, ls=(0, (8, 2, 2, 2)), label="alignment")[0],
+    ]
+    known, names = ax.get_legend_handles_labels()
+    handles += [h for h, name in zip(known, names) if name in ("check shot", "benchmark")]
+    figure.legend(handles=handles, loc="outside upper left", ncols=4, handlelength=2.2)
+    _colour_bar(figure, ax, norm, inputs, units)
+    _north_and_scale(ax, units)
+    return figure
+
+
+def _cells(ax: Axes, grid: Grid, line: Alignment, origin: np.ndarray, norm: Normalize, units: Units) -> None:
+    take = slice(None, None, max(1, len(grid.station) // MAX_PLAN_COLUMNS))
+    station, image = grid.station[take], grid.values["deviation"][:, take]
+    ds, do = _pitch(station), grid.cell_m[1]
+    edge_s = np.append(station - ds / 2, station[-1] + ds / 2)
+    edge_o = np.append(grid.offset - do / 2, grid.offset[-1] + do / 2)
+    s, o = np.meshgrid(edge_s, edge_o)
+    corner = (line.points(s, o) - origin) * units.per_metre
+    masked = np.ma.masked_invalid(units.to_deviation(image))
+    # One raster image inside the SVG: as vector cells this figure alone would be six megabytes.
+    ax.pcolormesh(corner[..., 0], corner[..., 1], masked, cmap=DEVIATION_MAP, norm=norm, rasterized=True)
+
+
+def _pitch(station: np.ndarray) -> float:
+    return float(station[1] - station[0]) if len(station) > 1 else 0.05
+
+
+def _outline(grid: Grid, line: Alignment) -> list[np.ndarray]:
+    """Rings around the cells that have a design, one per unbroken run of stations."""
+    inside = np.isfinite(grid.values["design_h"])
+    columns = np.flatnonzero(inside.any(axis=0))
+    if len(columns) == 0:
+        return []
+    ds, do = grid.cell_m
+    rings = []
+    for run in np.split(columns, np.flatnonzero(np.diff(columns) > 1) + 1):
+        left = grid.offset[inside[:, run].argmax(axis=0)] - do / 2
+        right = grid.offset[len(grid.offset) - 1 - inside[::-1, run].argmax(axis=0)] + do / 2
+        station = grid.station[run].copy()
+        station[0] -= ds / 2
+        station[-1] += ds / 2
+        keep = _corners(left, right)
+        ring = [line.points(station[keep], left[keep]), line.points(station[keep], right[keep])[::-1]]
+        rings.append(np.concatenate(ring))
+    return rings
+
+
+def _corners(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Indices at which the outline turns, and every tenth besides because the alignment may bend."""
+    turns = np.zeros(len(left), bool)
+    turns[[0, -1]] = True
+    turns[::10] = True
+    jump = (np.diff(left) != 0) | (np.diff(right) != 0)
+    turns[:-1] |= jump
+    turns[1:] |= jump
+    return np.flatnonzero(turns)
+
+
+def _station_marks(ax: Axes, line: Alignment, origin: np.ndarray, grid: Grid, units: Units) -> None:
+    """Ticks across the alignment at round stations, with their value."""
+    first, last = units.to_length([grid.station[0], grid.station[-1]])
+    ticks = [t for t in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(first, last) if first <= t <= last]
+    reach = float(np.abs(grid.offset).max()) + grid.cell_m[1]
+    for tick in ticks:
+        station = np.array(tick / units.per_metre)
+        ends = np.stack([line.points(station, np.array(o)) for o in (-reach, reach)])
+        ends = (ends - origin) * units.per_metre
+        ax.plot(*ends.T, color=palette.MUTED, lw=0.6)
+        along = ends[1] - ends[0]
+        away = along / np.hypot(*along)
+        ax.annotate(
+            text_of(tick, 0),
+            ends[1],
+            tuple(9 * away),
+            textcoords="offset points",
+            ha="center",
+            va="center",
+            fontsize=6.5,
+            color=palette.MUTED,
+        )
+
+
+def _colour_bar(figure: Figure, ax: Axes, norm: Normalize, inputs: ReportInputs, units: Units) -> None:
+    bar = figure.colorbar(
+        ScalarMappable(norm, DEVIATION_MAP), ax=ax, extend="both", aspect=28, pad=0.015, fraction=0.05
+    )
+    bar.outline.set_linewidth(0.4)
+    bar.set_label(f"− low (over-dug)   deviation [{units.deviation}]   + high (under-dug)", fontsize=7)
+    bar.ax.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: text_of(value, units.deviation_digits, True))
+    )
+    for limit in (inputs.site.tolerance.high_mm, -inputs.site.tolerance.low_mm):
+        bar.ax.axhline(float(units.to_deviation(limit / 1000)), color=palette.INK, lw=1.0)
+
+
+def _north_and_scale(ax: Axes, units: Units) -> None:
+    """North arrow and a scale bar of a round length, in the corners that are free."""
+    ax.annotate(
+        "N",
+        (0.965, 0.95),
+        (0.965, 0.80),
+        xycoords="axes fraction",
+        textcoords="axes fraction",
+        ha="center",
+        va="top",
+        fontsize=8,
+        fontweight="bold",
+        arrowprops={"arrowstyle": "-|>", "lw": 1.0, "fc": palette.INK, "ec": palette.INK},
+    )
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    width, height = right - left, top - bottom
+    wish = 0.2 * width
+    power = 10.0 ** np.floor(np.log10(wish))
+    length = max(step * power for step in (1, 2, 5) if step * power <= wish)
+    x, y = left + 0.03 * width, bottom + 0.05 * height
+    for part, colour in ((0, palette.INK), (1, palette.PAPER)):
+        ax.barh(
+            y,
+            length / 2,
+            left=x + part * length / 2,
+            height=0.012 * height,
+            color=colour,
+            ec=palette.INK,
+            lw=0.6,
+            zorder=5,
+        )
+    digits = 0 if length >= 1 else 1
+    ax.annotate(
+        f"{text_of(length, digits)} {units.length}",
+        (x + length, y),
+        (4, 0),
+        textcoords="offset points",
+        va="center",
+        fontsize=7,
+        zorder=5,
+    )
+
+
+def deviation_map(inputs: ReportInputs, grid: Grid, units: Units) -> Figure:
+    """Cells by station and offset; offset to the right of the alignment downwards, as one walks along."""
+    figure = new_figure(2.7)
+    ax = figure.subplots()
+    reach = scale_of(inputs, grid)
+    norm = Normalize(-float(units.to_deviation(reach)), float(units.to_deviation(reach)))
+    take = slice(None, None, max(1, len(grid.station) // MAX_MAP_COLUMNS))
+    deviation, state = grid.values["deviation"][:, take], grid.values["state"][:, take]
+    image = DEVIATION_MAP(norm(units.to_deviation(np.nan_to_num(deviation))))
+    known = np.isfinite(deviation)
+    image[~known] = to_rgba(palette.NEVER_TOUCHED)
+    image[~known & (state != "never touched")] = to_rgba(palette.PASSED_OVER)
+    ds, do = grid.cell_m
+    extent = units.to_length(
+        [
+            grid.station[0] - ds / 2,
+            grid.station[-1] + ds / 2,
+            grid.offset[-1] + do / 2,
+            grid.offset[0] - do / 2,
+        ]
+    )
+    pixels = (np.clip(image, 0, 1) * 255).round().astype(np.uint8)
+    ax.imshow(pixels, extent=tuple(extent.tolist()), aspect="auto", interpolation="none", origin="upper")
+    inside = np.isfinite(grid.values["design_h"])
+    columns = np.flatnonzero(inside.any(axis=0))
+    if len(columns):
+        x = units.to_length(grid.station[columns])
+        for edge in (
+            grid.offset[inside[:, columns].argmax(axis=0)] - do / 2,
+            grid.offset[len(grid.offset) - 1 - inside[::-1, columns].argmax(axis=0)] + do / 2,
+        ):
+            ax.plot(x, units.to_length(edge), color=palette.DESIGN, lw=0.6)
+    ax.grid(False)
+    ax.set_xlabel(f"Station [{units.length}]")
+    ax.set_ylabel(f"Offset [{units.length}], right is +")
+    handles = [
+        Patch(fc=palette.PASSED_OVER, ec=palette.MUTED, lw=0.4, label="passed over"),
+        Patch(fc=palette.NEVER_TOUCHED, ec=palette.MUTED, lw=0.4, label="never touched"),
+        Patch(fc="none", ec=palette.DESIGN, lw=0.6, label="design"),
+    ]
+    figure.legend(handles=handles, loc="outside upper right", ncols=3, handlelength=1.4)
+    bar = figure.colorbar(
+        ScalarMappable(norm, DEVIATION_MAP), ax=ax, extend="both", pad=0.015, fraction=0.05, aspect=16
+    )
+    bar.outline.set_linewidth(0.4)
+    bar.set_label(f"Deviation [{units.deviation}]")
+    bar.ax.yaxis.set_major_formatter(
+        FuncFormatter(lambda value, _: text_of(value, units.deviation_digits, True))
+    )
+    return figure

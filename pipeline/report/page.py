@@ -1,0 +1,247 @@
+"""The page: one dict of everything that is printed, the figures beside it, and the HTML made of both.
+
+The dict is report.json. Templates print it and compute nothing, so what the page says and what
+report.json says cannot part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup, escape
+
+from pipeline.report import charts, evidence, facts, maps, measured, numbers, palette, profiles
+from pipeline.report.attention import attention
+from pipeline.report.drawing import house_style, svg_of
+from pipeline.report.evidence import Timeline
+from pipeline.report.inputs import ReportInputs
+from pipeline.report.provenance import method, provenance
+from pipeline.report.units import Units, text_of, units_of
+from pipeline.report.words import Words
+from pipeline.resources import template_folder
+
+FORMAT = "gradetrace/report/1"
+
+
+@dataclass(frozen=True)
+class Page:
+    """A rendered report."""
+
+    html: str
+    content: dict[str, Any]
+    """report.json."""
+
+
+def render(inputs: ReportInputs, language: str = "en") -> Page:
+    """The page of a run and the dict of every number on it; the same inputs give the same bytes."""
+    words = Words(language)
+    units = units_of(inputs.site.grid.unit, inputs.site.grid.metres_per_unit)
+    content, pictures = compose(inputs, units, words)
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(template_folder()),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"num": _num, "cell": _cell, "verdict": _verdict}
+    style = Markup((template_folder() / "style.css").read_text(encoding="utf-8"))
+    svg = {name: Markup(text) for name, text in pictures.items()}
+    html = environment.get_template("report.html").render(page=content, svg=svg, w=words, style=style)
+    return Page(html, content)
+
+
+def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str, Any], dict[str, str]]:
+    """Everything that is printed, and the figures as SVG by name."""
+    stations, checks, as_built = (inputs.table(name) for name in ("stations", "checks", "as_built"))
+    grid = None if as_built is None else measured.grid_of(as_built)
+    timeline = evidence.timeline_of(inputs)
+    statistics = measured.check_statistics(inputs, units)
+    sections = [] if grid is None else measured.sections_of(inputs, grid)
+    content: dict[str, Any] = {
+        "format": FORMAT,
+        "language": words.language,
+        "title": inputs.site.report.title or words("page.title"),
+        "company": inputs.site.report.company,
+        "version": inputs.versions.get("gradetrace", words("page.unknown")),
+        "units": {"length": units.length, "deviation": units.deviation},
+        "verdict": facts.verdict_of(inputs, words),
+        "surveyed": facts.surveyed(inputs, units, words),
+        "summary": facts.summary(inputs, units, words, statistics),
+        "attention": attention(inputs, units, words, timeline, statistics),
+        "stations": None if stations is None else measured.stations_table(stations, units, words),
+        "cells": None if grid is None else measured.cells_table(inputs, grid, units, words),
+        "cross_sections": measured.sections_table(sections, units, words) if sections else None,
+        "checks": None if checks is None else measured.checks_table(checks, units, words),
+        "check_statistics": _labelled_statistics(statistics, words),
+        "indicative": statistics is not None and statistics["n"]["value"] < measured.INDICATIVE_BELOW,
+        "error_budget": evidence.error_budget(inputs, units, words),
+        "coverage": evidence.coverage(inputs, words),
+        "quality": evidence.quality(inputs, words),
+        "points": maps.points_table(inputs, units, words),
+        **evidence.statics(inputs, words),
+        "method": method(inputs, units, words),
+        "provenance": provenance(inputs, words),
+    }
+    content["missing"] = {
+        name: words("page.not_available", why=inputs.why_missing(name))
+        for name in ("stations", "as_built", "checks", "residuals", "statics", "frames", "solution.json")
+    }
+    pictures, content["figures"] = _figures(inputs, units, words, grid, timeline, sections)
+    return content, pictures
+
+
+def _labelled_statistics(statistics, words: Words) -> list[dict[str, Any]] | None:
+    if statistics is None:
+        return None
+    return [{"key": k, "label": words(f"statistics.{k}"), "number": v} for k, v in statistics.items()]
+
+
+def _figures(
+    inputs: ReportInputs,
+    units: Units,
+    words: Words,
+    grid: measured.Grid | None,
+    timeline: Timeline | None,
+    sections: list[measured.Section],
+) -> tuple[dict[str, str], dict[str, dict[str, str]]]:
+    """SVG by name, and title, sentence and description of every figure, drawn or not."""
+    pictures: dict[str, str] = {}
+    about: dict[str, dict[str, str]] = {}
+    stations, checks = inputs.table("stations"), inputs.table("checks")
+
+    def add(name: str, missing: str, draw, **places: Any) -> None:
+        key = f"figures.{name}"
+        about[name] = {
+            "title": words(f"{key}.title"),
+            "good": words(f"{key}.good"),
+            "description": "",
+            "why": "",
+        }
+        if draw is None:
+            about[name]["why"] = words("page.not_available", why=inputs.why_missing(missing))
+            return
+        about[name]["description"] = words(f"{key}.description", **places)
+        figure = draw()
+        pictures[name] = svg_of(figure, f"figure-{name}", about[name]["title"], about[name]["description"])
+
+    with house_style():
+        line = inputs.alignment
+        if grid is not None and line is not None:
+            cut = grid.station[np.isfinite(grid.values["h"]).any(axis=0)]
+            ends = (cut[0], cut[-1]) if len(cut) else (grid.station[0], grid.station[-1])
+            add(
+                "plan",
+                "",
+                lambda: maps.plan(inputs, line, grid, units),
+                checks=0 if checks is None else len(checks["point"]),
+                benchmarks=len(inputs.site.benchmarks),
+                first=facts.station_text(ends[0], units),
+                last=facts.station_text(ends[1], units),
+            )
+        else:
+            add("plan", "as_built" if grid is None else "alignment", None)
+        if stations is not None:
+            dug = stations["deviation"][np.isfinite(stations["deviation"])]
+            add(
+                "long_section",
+                "",
+                lambda: profiles.long_section(inputs, stations, grid, units),
+                low=facts.deviation_text(dug.min() if len(dug) else None, units),
+                high=facts.deviation_text(dug.max() if len(dug) else None, units),
+            )
+        else:
+            add("long_section", "stations", None)
+        if sections:
+            add(
+                "cross_sections",
+                "",
+                lambda: profiles.cross_sections(inputs, sections, units),
+                n=len(sections),
+            )
+        else:
+            add("cross_sections", "as_built", None)
+        if grid is not None:
+            count = {
+                name: int((grid.values["state"] == name).sum())
+                for name in ("cut", "passed over", "never touched")
+            }
+            add(
+                "deviation_map",
+                "",
+                lambda: maps.deviation_map(inputs, grid, units),
+                cut=count["cut"],
+                passed=count["passed over"],
+                never=count["never touched"],
+            )
+        else:
+            add("deviation_map", "as_built", None)
+        compared = 0 if checks is None else int(np.isfinite(checks["difference"]).sum())
+        add(
+            "checks",
+            "checks",
+            (lambda: profiles.check_shots(checks, units)) if compared else None,
+            n=compared,
+        )
+        parts = evidence.budget_parts(inputs)
+        text = ", ".join(
+            f"{name} {facts.deviation_number(v, units, False, True)['value']}" for name, v in parts
+        )
+        add(
+            "error_budget",
+            "solution.json",
+            (lambda: charts.error_budget(parts, units)) if parts else None,
+            text=f"{text} {units.deviation}",
+        )
+        if timeline is not None:
+            add(
+                "coverage",
+                "",
+                lambda: charts.coverage(timeline),
+                cameras=len(timeline.frames),
+                gaps=len(timeline.gaps_ns),
+                seconds=numbers.duration_text(timeline.bridged_s),
+            )
+        else:
+            add("coverage", "frames", None)
+        histogram = evidence.residual_histogram(inputs)
+        if histogram is not None:
+            length = inputs.tables["residuals"]["normalised"]
+            add(
+                "residuals",
+                "",
+                lambda: charts.residuals(*histogram),
+                n=len(length),
+                beyond=text_of(100 * float(np.mean(length > evidence.FAR)), 1),
+            )
+        else:
+            add("residuals", "residuals", None)
+    return pictures, about
+
+
+def _num(value: numbers.Number, key: str) -> Markup:
+    """A number with its unit; `key` is its path in report.json, by which tests read the page back."""
+    shown = text_of(value["value"], value["digits"], value["signed"])
+    unit = Markup(' <span class="unit">{}</span>').format(value["unit"]) if value["unit"] else Markup("")
+    raw = "" if value["value"] is None else repr(value["value"])
+    return Markup('<data class="number" data-key="{}" value="{}">{}</data>{}').format(key, raw, shown, unit)
+
+
+def _cell(value: Any, column: dict[str, Any]) -> Markup:
+    """The content of a table's cell."""
+    if column["kind"] == "verdict":
+        return _verdict(value)
+    if column["digits"] is None:
+        return escape(value)
+    return escape(text_of(value, column["digits"], column["signed"]))
+
+
+def _verdict(word: str) -> Markup:
+    """A verdict in symbol and word."""
+    style = palette.verdict_style(word)
+    return Markup('<span class="verdict {}"><span aria-hidden="true">{}</span> {}</span>').format(
+        style.slug, style.symbol, style.word
+    )

@@ -1,0 +1,283 @@
+"""Figures along and across the trench: long section, cross sections, check shots."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from pipeline.report import palette
+from pipeline.report.drawing import WIDTH_IN, decimated, new_figure
+from pipeline.report.inputs import ReportInputs, Table
+from pipeline.report.measured import Grid, Section
+from pipeline.report.units import Units, text_of
+
+SIGMAS = 2.0
+"""Half width of every ribbon and bar."""
+
+
+def with_gaps(station: np.ndarray, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
+    """The columns with a NaN wherever stations are missing from their regular row, so that lines break there."""
+    if len(station) < 3:
+        return station, *columns
+    step = np.diff(station)
+    holes = np.flatnonzero(step > 1.5 * np.median(step)) + 1
+    middle = (station[holes - 1] + station[np.minimum(holes, len(station) - 1)]) / 2
+    return np.insert(station, holes, middle), *(
+        np.insert(np.asarray(c, float), holes, np.nan) for c in columns
+    )
+
+
+def long_section(inputs: ReportInputs, stations: Table, grid: Grid | None, units: Units) -> Figure:
+    """Elevation, deviation and verdict by station, one above the other."""
+    figure = new_figure(6.0)
+    axes = figure.subplots(3, 1, sharex=True, height_ratios=[2.0, 2.4, 0.9])
+    s, h, design, deviation, own, common = with_gaps(
+        *(
+            np.asarray(stations[k], float)
+            for k in ("station", "h", "design_h", "deviation", "sigma_own", "sigma_common")
+        )
+    )
+    x = units.to_length(s)
+    half = SIGMAS * np.hypot(own, common)
+    high, low = inputs.site.tolerance.high_mm / 1000, inputs.site.tolerance.low_mm / 1000
+    _elevations(axes[0], x, h, design, half, (low, high), units)
+    _deviations(axes[1], x, deviation, half, (low, high), grid, units)
+    checks = inputs.table("checks")
+    if checks is not None:
+        _shots(axes[0], axes[1], checks, stations, units)
+    _verdicts(axes[2], stations, units)
+    axes[2].set_xlabel(f"Station [{units.length}]")
+    edge = 0.02 * (np.nanmax(x) - np.nanmin(x) or 1.0)
+    axes[2].set_xlim(np.nanmin(x) - edge, np.nanmax(x) + edge)
+    for ax in axes[:2]:
+        # Beside the axes, never on a line: the station axis is the dear one here, so above.
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2, handlelength=1.6)
+    figure.align_ylabels(axes)
+    return figure
+
+
+def _elevations(ax: Axes, x, h, design, half, tolerance: tuple[float, float], units: Units) -> None:
+    low, high = tolerance
+    ax.fill_between(
+        x,
+        units.to_length(design - low),
+        units.to_length(design + high),
+        color=palette.BAND,
+        lw=0,
+        label="tolerance",
+    )
+    ax.plot(x, units.to_length(design), color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)), label="design")
+    ax.fill_between(x, units.to_length(h - half), units.to_length(h + half), color=palette.RIBBON, lw=0)
+    ax.plot(x, units.to_length(h), color=palette.AS_BUILT, label="as-built")
+    ax.set_ylabel(f"Elevation [{units.length}]")
+    ax.set_title("Elevation")
+
+
+def _deviations(
+    ax: Axes, x, deviation, half, tolerance: tuple[float, float], grid: Grid | None, units: Units
+):
+    low, high = (float(units.to_deviation(t)) for t in tolerance)
+    ax.axhspan(-low, high, color=palette.BAND, lw=0)
+    ax.axhline(0, color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)))
+    if grid is not None:
+        fine = _centre_line(grid)
+        ax.plot(
+            *decimated(units.to_length(fine[0]), units.to_deviation(fine[1])),
+            color=palette.MUTED,
+            lw=0.5,
+            alpha=0.75,
+            label="centre cells",
+        )
+    ax.fill_between(
+        x,
+        units.to_deviation(deviation - half),
+        units.to_deviation(deviation + half),
+        color=palette.RIBBON,
+        alpha=0.8,
+        lw=0,
+        label="± 2 sigma",
+    )
+    ax.plot(x, units.to_deviation(deviation), color=palette.AS_BUILT, label="station mean")
+    # A lone station between two gaps has no line to be seen by.
+    alone = np.isfinite(deviation) & ~np.isfinite(np.r_[np.nan, deviation[:-1]])
+    alone &= ~np.isfinite(np.r_[deviation[1:], np.nan])
+    ax.plot(x[alone], units.to_deviation(deviation[alone]), "o", ms=2.5, color=palette.AS_BUILT)
+    digits = units.deviation_digits
+    for value, va in ((high, "bottom"), (-low, "top")):
+        ax.annotate(
+            text_of(value, digits, signed=True),
+            (1.0, value),
+            xycoords=("axes fraction", "data"),
+            xytext=(2, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=6.5,
+            color=palette.MUTED,
+            annotation_clip=False,
+        )
+    reach = (
+        np.nanmax(np.abs(np.r_[deviation + half, deviation - half])) if np.isfinite(deviation).any() else 0
+    )
+    reach = max(float(units.to_deviation(reach)), 1.15 * high, 1.15 * low)
+    ax.set_ylim(-1.08 * reach, 1.08 * reach)
+    ax.set_ylabel(f"Deviation [{units.deviation}]")
+    ax.set_title("Deviation: + high (under-dug), − low (over-dug)")
+
+
+def _centre_line(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
+    row = int(np.argmin(np.abs(grid.offset)))
+    return grid.station, grid.values["deviation"][row]
+
+
+def _shots(above: Axes, below: Axes, checks: Table, stations: Table, units: Units) -> None:
+    """Check shots: their elevation above, and below where the shot lies against the design at its station."""
+    on = np.isfinite(checks["station"])
+    station, h = np.asarray(checks["station"], float)[on], np.asarray(checks["h"], float)[on]
+    sigma = np.asarray(checks["sigma_ts"], float)[on]
+    marks = {"fmt": "D", "ms": 3.2, "mfc": "white", "mec": palette.CHECK, "ecolor": palette.CHECK, "mew": 0.9}
+    above.errorbar(
+        units.to_length(station),
+        units.to_length(h),
+        SIGMAS * units.to_length(sigma),
+        elinewidth=0.8,
+        label="check shots",
+        **marks,
+    )
+    compared = np.asarray(checks["result"])[on] == "compared"
+    design = np.interp(station, stations["station"], stations["design_h"], left=np.nan, right=np.nan)
+    below.errorbar(
+        units.to_length(station[compared]),
+        units.to_deviation((h - design)[compared]),
+        SIGMAS * units.to_deviation(sigma[compared]),
+        elinewidth=0.8,
+        label="check shots",
+        **marks,
+    )
+
+
+def _verdicts(ax: Axes, stations: Table, units: Units) -> None:
+    """One row of marks per verdict, so that no verdict is told by colour alone."""
+    names = list(palette.VERDICTS)
+    found = np.asarray(stations["verdict"], str)
+    for row, name in enumerate(names):
+        style = palette.VERDICTS[name]
+        at = units.to_length(np.asarray(stations["station"], float)[found == name])
+        ax.plot(
+            at,
+            np.full(len(at), row),
+            style.marker,
+            color=style.ink,
+            ms=4,
+            mew=1.4 if style.marker == "_" else 0,
+        )
+    ax.set_yticks(range(len(names)), [f"{palette.VERDICTS[n].symbol} {n}" for n in names])
+    ax.set_ylim(len(names) - 0.4, -0.6)
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="y", visible=False)
+    ax.set_title("Verdict")
+
+
+def cross_sections(inputs: ReportInputs, sections: list[Section], units: Units) -> Figure:
+    """Small multiples, all with the same scales: elevation by offset."""
+    columns = min(3, len(sections))
+    rows = -(-len(sections) // columns)
+    figure = new_figure(0.35 + 1.65 * rows, WIDTH_IN)
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True)
+    low, high = inputs.site.tolerance.low_mm / 1000, inputs.site.tolerance.high_mm / 1000
+    reach = [_limits(section, low, high) for section in sections]
+    height = max(top - bottom for bottom, top in reach)
+    for ax, section, (bottom, top) in zip(axes.flat, sections, reach):
+        x, half = units.to_length(section.offset), SIGMAS * section.sigma
+        d, h = section.design_h, section.h
+        ax.fill_between(
+            x,
+            units.to_length(d - low),
+            units.to_length(d + high),
+            color=palette.BAND,
+            lw=0,
+            label="tolerance",
+        )
+        ax.plot(x, units.to_length(d), color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)), label="design")
+        ax.fill_between(
+            x,
+            units.to_length(h - half),
+            units.to_length(h + half),
+            color=palette.RIBBON,
+            lw=0,
+            label="± 2 sigma",
+        )
+        ax.plot(x, units.to_length(h), color=palette.AS_BUILT, label="as-built")
+        middle = (bottom + top) / 2
+        ax.set_ylim(*units.to_length([middle - 0.55 * height, middle + 0.55 * height]))
+        ax.yaxis.set_major_locator(MaxNLocator(4))
+        ax.xaxis.set_major_locator(MaxNLocator(5))
+        mark = "  (one of the worst)" if section.why == "worst" else ""
+        ax.set_title(
+            f"{text_of(float(units.to_length(section.station)), units.station_digits)} {units.length}{mark}"
+        )
+    for ax in axes.flat[len(sections) :]:
+        ax.remove()
+    for at in range(columns):
+        lowest = max(i for i in range(len(sections)) if i % columns == at)
+        axes.flat[lowest].set_xlabel(f"Offset [{units.length}]")
+        axes.flat[lowest].tick_params(labelbottom=True)
+    for row in axes:
+        row[0].set_ylabel(f"Elevation [{units.length}]")
+    handles, labels = axes.flat[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=4, handlelength=1.6)
+    return figure
+
+
+def _limits(section: Section, low: float, high: float) -> tuple[float, float]:
+    half = SIGMAS * section.sigma
+    known = np.concatenate(
+        [section.design_h - low, section.design_h + high, section.h - half, section.h + half]
+    )
+    return float(np.nanmin(known)), float(np.nanmax(known))
+
+
+def check_shots(checks: Table, units: Units) -> Figure:
+    """Difference of each compared shot with two combined sigmas, by station."""
+    compared = np.isfinite(np.asarray(checks["difference"], float))
+    x = units.to_length(np.asarray(checks["station"], float)[compared])
+    y = units.to_deviation(np.asarray(checks["difference"], float)[compared])
+    bar = SIGMAS * units.to_deviation(np.hypot(checks["sigma"], checks["sigma_ts"])[compared])
+    figure = new_figure(2.4)
+    ax = figure.subplots()
+    ax.axhline(0, color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)))
+    ax.errorbar(
+        x,
+        y,
+        bar,
+        fmt="D",
+        ms=3.2,
+        mfc="white",
+        mec=palette.CHECK,
+        ecolor=palette.CHECK,
+        elinewidth=0.8,
+        mew=0.9,
+        capsize=1.5,
+    )
+    reach = 1.15 * float(np.max(np.abs(y) + bar))
+    ax.set_ylim(-reach, reach)
+    ax.set_ylabel(f"Difference [{units.deviation}]")
+    ax.set_xlabel(f"Station [{units.length}]")
+    if len(x) <= 25:
+        names = [_short(str(p)) for p in np.asarray(checks["point"])[compared]]
+        for name, at, top in zip(names, x, y + bar):
+            ax.annotate(
+                name,
+                (at, top),
+                (0, 2),
+                textcoords="offset points",
+                ha="center",
+                fontsize=6,
+                color=palette.MUTED,
+            )
+    return figure
+
+
+def _short(name: str) -> str:
+    return name if len(name) <= 8 else name[:7] + "…"

@@ -1,0 +1,82 @@
+"""How it was done and what it rests on: the method in words, files, versions, fingerprints."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.report import numbers
+from pipeline.report.facts import deviation_text
+from pipeline.report.inputs import FileSource, ReportInputs
+from pipeline.report.numbers import column
+from pipeline.report.units import Units
+from pipeline.report.words import Words
+
+
+def method(inputs: ReportInputs, units: Units, words: Words) -> list[str]:
+    """The method of this run, one sentence or two per paragraph."""
+    site = inputs.site
+    tolerance = site.tolerance
+    cell = deviation_text(site.survey.cell_m, units, signed=False)
+    k = f"{tolerance.coverage_factor:g}"
+    low, high = (
+        deviation_text(tolerance.low_mm / 1000, units, False),
+        deviation_text(tolerance.high_mm / 1000, units, False),
+    )
+    return [
+        words("method.sign"),
+        words("method.rule", low=low, high=high),
+        words("method.sigma", k=k),
+        words(f"method.{site.survey.surface}", cell=cell),
+        words("method.cells"),
+        words("method.network"),
+        words("method.check"),
+        words("method.units", units=units.describe()),
+    ]
+
+
+def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
+    """Tables of files, stages and versions."""
+    files: list[tuple[str, FileSource]] = [
+        ("log", inputs.log),
+        ("machine", inputs.machine_file),
+        ("site", inputs.site_file),
+    ]
+    files += [(kind, source) for kind, source in inputs.named_files.items()]
+    file_columns = [
+        column("what", words("columns.what")),
+        column("name", words("columns.name"), kind="name"),
+        column("origin", words("columns.origin")),
+        column("sha256", words("columns.sha256"), kind="code"),
+    ]
+    stage_columns = [
+        column("stage", words("columns.stage")),
+        column("version", words("columns.version"), "", 0),
+        column("fingerprint", words("columns.fingerprint"), kind="code"),
+    ]
+    version_columns = [column("name", words("columns.name")), column("version", words("columns.version"))]
+    return {
+        "files": numbers.table(
+            file_columns,
+            [
+                {
+                    "what": words(f"provenance.{kind}"),
+                    "name": source.name,
+                    "origin": words(f"origins.{source.origin}")
+                    if words.has(f"origins.{source.origin}")
+                    else source.origin,
+                    "sha256": source.sha256,
+                }
+                for kind, source in files
+            ],
+        ),
+        "stages": numbers.table(
+            stage_columns,
+            [
+                {"stage": stage, "version": m.get("version"), "fingerprint": m.get("fingerprint", "")}
+                for stage, m in inputs.manifests.items()
+            ],
+        ),
+        "versions": numbers.table(
+            version_columns, [{"name": name, "version": version} for name, version in inputs.versions.items()]
+        ),
+    }
