@@ -43,6 +43,7 @@ BORDERS = {
     "matplotlib": {"report"},
     "jinja2": {"report"},
     "pydantic": {"config"},
+    "pydantic_core": {"config"},
     "click": {"cli"},
     "rich": {"cli", "progress"},
     "simplejpeg": {"detection", "synthetic"},

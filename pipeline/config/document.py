@@ -8,8 +8,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
+from pydantic_core import ErrorDetails
 
 from pipeline.config.machine import Machine
+from pipeline.config.quantities import PATTERNS
 from pipeline.config.site import Site
 from pipeline.errors import ConfigError
 
@@ -90,13 +92,7 @@ def _sentences(error: ValidationError, data: dict[str, Any], text: str, source: 
         # pydantic also calls the third number of a pair of numbers missing.
         missing = problem["type"] == "missing" and isinstance(problem["loc"][-1], str)
         location = _in_file(problem["loc"], data, missing)
-        message = {
-            "missing": "is missing" if missing else "has too few values",
-            "extra_forbidden": "is not a key that is known here",
-        }.get(
-            problem["type"],
-            problem["msg"].removeprefix("Value error, ").replace("Input should be", "should be"),
-        )
+        message = _message(problem, missing)
         if not location and (quoted := _quoted_key(message, data)):
             location, message = quoted
         if message not in messages.setdefault(location, []):
@@ -113,6 +109,16 @@ def _sentences(error: ValidationError, data: dict[str, Any], text: str, source: 
     if len(messages) > 5:
         lines.append(f"{source}: and {len(messages) - 5} more")
     return "\n".join(lines)
+
+
+def _message(problem: ErrorDetails, missing: bool) -> str:
+    if problem["type"] == "missing":
+        return "is missing" if missing else "has too few values"
+    if problem["type"] == "extra_forbidden":
+        return "is not a key that is known here"
+    if problem["type"] == "string_pattern_mismatch":
+        return PATTERNS[problem["ctx"]["pattern"]]
+    return problem["msg"].removeprefix("Value error, ").replace("Input should be", "should be")
 
 
 def _in_file(location: Location, data: Any, missing: bool) -> Location:

@@ -9,14 +9,23 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
-from pipeline.config.quantities import Name, NonNegative, Pose, Positive, Print, Section, check_covariance
+from pipeline.config.quantities import (
+    Identifier,
+    Name,
+    NonNegative,
+    Pose,
+    Positive,
+    Print,
+    Section,
+    check_covariance,
+)
 from pipeline.errors import ConfigError
 
 FORMAT = "gradetrace/machine/1"
 
 
 class MachineIdentity(Section):
-    id: Name
+    id: Identifier
     name: str = ""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -10,6 +10,13 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from pipeline.geometry import se3, so3
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_-]{0,39}$")]
+Identifier = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_.-]{0,59}$")]
+"""Of a machine or a site. It begins with a letter, or readers of partitioned Parquet make it a number."""
+PATTERNS = {
+    r"^[A-Za-z][A-Za-z0-9_-]{0,39}$": "should begin with a letter and hold at most 40 letters, digits, _ and -",
+    r"^[A-Za-z][A-Za-z0-9_.-]{0,59}$": "should begin with a letter and hold at most 60 letters, digits, _, . and -",
+}
+"""What a person is told instead of the pattern."""
 Triple = tuple[float, float, float]
 NonNegative = Annotated[float, Field(ge=0)]
 Positive = Annotated[float, Field(gt=0)]
@@ -98,7 +105,7 @@ FAMILIES = {"tag36h11": 587, "tag25h9": 35, "tag16h5": 30, "tagStandard41h12": 2
 class Print(Section):
     """What is printed on a marker: the family and the layout of its tags."""
 
-    family: Annotated[str, Field(pattern="^(" + "|".join(FAMILIES) + ")$")]
+    family: Literal["tag36h11", "tag25h9", "tag16h5", "tagStandard41h12"]
     tags: Annotated[tuple[Tag, ...], Field(min_length=1)]
 
     @model_validator(mode="after")

@@ -7,7 +7,17 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from pipeline.config.quantities import Name, NonNegative, Pose, Positive, Print, Section, SigmaTriple, Triple
+from pipeline.config.quantities import (
+    Identifier,
+    Name,
+    NonNegative,
+    Pose,
+    Positive,
+    Print,
+    Section,
+    SigmaTriple,
+    Triple,
+)
 
 FORMAT = "gradetrace/site/1"
 MAX_FROM_ORIGIN_M = 20_000.0
@@ -16,7 +26,7 @@ METRES_PER_UNIT = {"m": 1.0, "international_foot": 0.3048, "us_survey_foot": 120
 
 
 class SiteIdentity(Section):
-    id: Name
+    id: Identifier
     name: str = ""
 
 

@@ -119,7 +119,7 @@ MACHINE_MISTAKES = [
         "cameras.front.intrinsics",
         "found 2",
     ),
-    ('id = "EX-1"', 'id = "1"', 'id = "1"', "machine.id", "found '1'"),
+    ('id = "EX-1"', 'id = "1"', 'id = "1"', "machine.id", "begin with a letter"),
     ('format = "gradetrace/machine/1"', 'format = "2"', 'format = "2"', "format", "gradetrace/machine/1"),
 ]
 
