@@ -1,0 +1,202 @@
+"""The adjustment of a whole log at once: eq. (1) to (3) of the paper, with its statics among the unknowns."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.config.site import EstimationSettings
+from pipeline.errors import EstimationError
+from pipeline.estimation import diagnostics
+from pipeline.estimation.marginals import (
+    BodyTrack,
+    Marginals,
+    body_track,
+    common_part,
+    marginals,
+    vertical_budget,
+)
+from pipeline.estimation.optimise import Optimum, optimise
+from pipeline.estimation.problem import Problem, problem_of
+from pipeline.estimation.solution import BodyStates, Solution
+from pipeline.estimation.values import Values, statics_of
+from pipeline.network import frames as fr
+from pipeline.network.datum import tie as tie_network
+from pipeline.network.epochs import Epochs, epochs_of
+from pipeline.network.model import SOURCES, Network, Observations, Readings
+from pipeline.network.start import start as start_values
+
+
+def adjust(
+    network: Network,
+    observations: Observations,
+    readings: dict[str, Readings],
+    settings: EstimationSettings | None = None,
+) -> Solution:
+    """Poses of every body at every epoch, and the statics, that fit everything best; with their covariances.
+
+    Parameters
+    ----------
+    network : Network
+        Of ``network_of``.
+    observations : Observations
+        Every accepted tag of every frame.
+    readings : dict of str to Readings
+        By name of the sensor; a sensor that is missing here was not recorded.
+    settings : EstimationSettings, optional
+
+    Returns
+    -------
+    Solution
+
+    Raises
+    ------
+    NetworkError
+        What carries the cutting edge is tied to nothing surveyed; the message says what would tie it.
+    EstimationError
+        The normal equations cannot be solved.
+    """
+    settings = settings or EstimationSettings()
+    tied = tie_network(network, observations, readings)
+    epochs = epochs_of(network, observations.take(tied.used), readings)
+    problem = problem_of_log(network, tied, epochs)
+    optimum = optimise(problem, settings.huber, settings.max_iterations)
+    return solution_of(problem, optimum, settings)
+
+
+def problem_of_log(network: Network, tied, epochs: Epochs) -> Problem:
+    """The least-squares problem of a log, with its start."""
+    first = start_values(network, tied, epochs)
+    statics = statics_of(network, first)
+    return problem_of(network, tied, epochs, statics, Values(first.pose, first.rate, np.zeros(statics.size)))
+
+
+def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings) -> Solution:
+    """Marginals, tables and diagnostics at the optimum."""
+    values, weights = optimum.values, optimum.weights
+    found = marginals(problem, values, weights)
+    seen, span = _coverage(problem, settings.max_gap_s)
+    states = []
+    budget: dict = {}
+    for name in [*problem.network.bodies, fr.TOOL]:
+        frame = fr.TOOL if name == fr.TOOL else fr.body_frame(name)
+        if name == fr.WORLD or frame not in problem.tie.frames:
+            continue
+        track = body_track(problem, values, found, frame, name)
+        rows, body_seen = _published(track, seen, span)
+        if name == fr.TOOL:
+            budget = _budget(problem, found, track, rows[body_seen[rows]])
+        states.append(_states(problem, values, found, track, rows, body_seen))
+    corner_fits = diagnostics.fit_corners(problem, values, weights, found)
+    sensor_fits = diagnostics.fit_sensors(problem, values, weights, found)
+    table = diagnostics.corner_table(problem, corner_fits)
+    statics = diagnostics.static_results(problem, values, found)
+    warnings = [*problem.tie.warnings, *diagnostics.moved_statics(statics)]
+    if not optimum.converged:
+        warnings.append(
+            f"the adjustment stopped after {optimum.iterations} iterations with a last step of "
+            f"{optimum.last_step_sigmas:.2g} sigma; raise estimation.max_iterations"
+        )
+    whole = diagnostics.variance_component(corner_fits + sensor_fits, settings.huber)
+    variance = whole["sigma0_squared"]
+    figures = {
+        "sigma0": None if variance is None else round(variance**0.5, 4),
+        "sigma0_squared": variance,
+        "redundancy": whole["redundancy"],
+        "iterations": optimum.iterations,
+        "converged": optimum.converged,
+        "last_step_sigmas": float(f"{optimum.last_step_sigmas:.3g}"),
+        "epochs": len(problem.epochs.time_ns),
+        "unknowns": {
+            "statics": problem.statics.size,
+            "states": len(problem.epochs.time_ns) * sum(v.size for v in problem.tie.variables),
+        },
+        "chains": [[problem.tie.variables[k].body for k in chain] for chain in problem.chains],
+        "anchors": {
+            v.body: problem.tie.frames.edges[fr.body_frame(v.body)].parent for v in problem.tie.variables
+        },
+        "cost": round(float(optimum.cost), 3),
+        "global_test": whole,
+        "corners": diagnostics.variance_component(corner_fits, settings.huber),
+        "sensors": {
+            s.sensor.name: diagnostics.variance_component([f], settings.huber)
+            for s, f in zip(problem.sensors, sensor_fits, strict=True)
+        },
+        "motion": diagnostics.motion_fit(problem, values),
+        "pixels": diagnostics.pixel_rms(problem.network, table),
+        "dropped": problem.epochs.dropped,
+        "error_budget": budget,
+        "warnings": warnings,
+    }
+    return Solution(tuple(states), tuple(statics), table, figures, tuple(warnings))
+
+
+def _coverage(problem: Problem, max_gap_s: float):
+    """Per variable: which epochs have an observation near, and its first and last one."""
+    E, t = len(problem.epochs.time_ns), problem.epochs.time_s
+    when = [np.zeros(E, dtype=bool) for _ in problem.tie.variables]
+    for group in problem.corners:
+        for step in group.path:
+            if step.edge.kind != "static":
+                when[step.edge.index][group.epoch] = True
+    for readings in problem.sensors:
+        when[readings.variable][readings.epoch] = True
+    near, span = [], []
+    for variable, mask in zip(problem.tie.variables, when, strict=True):
+        at = np.flatnonzero(mask)
+        if len(at) == 0:
+            raise EstimationError(f"body '{variable.body}' has no observation that can be used")
+        after = t[at[np.minimum(np.searchsorted(at, np.arange(E)), len(at) - 1)]]
+        before = t[at[np.maximum(np.searchsorted(at, np.arange(E), side="right") - 1, 0)]]
+        near.append(np.minimum(np.abs(after - t), np.abs(t - before)) <= max_gap_s)
+        span.append((at[0], at[-1]))
+    return near, span
+
+
+def _published(track: BodyTrack, seen, span):
+    """Rows between the first and last observation of everything the body hangs on; and seen at every epoch."""
+    E = len(track.T_world_body)
+    first = max((span[k][0] for k in track.variables), default=0)
+    last = min((span[k][1] for k in track.variables), default=E - 1)
+    together = (
+        np.logical_and.reduce([seen[k] for k in track.variables]) if track.variables else np.ones(E, bool)
+    )
+    return np.arange(first, last + 1), together
+
+
+def _states(problem: Problem, values: Values, found: Marginals, track: BodyTrack, rows, seen) -> BodyStates:
+    angle, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
+    for k, variable in enumerate(problem.tie.variables):
+        if variable.body == track.body and variable.kind == "joint":
+            c, at = problem.place(k)
+            y = found.Y[c][rows, at.start]
+            variance = found.Z[c][rows, at.start, at.start]
+            variance = variance + np.einsum(
+                "ni,ij,nj->n", y, found.P_zz[np.ix_(found.columns[c], found.columns[c])], y
+            )
+            angle, sigma = values.pose[k][rows], np.sqrt(variance)
+    return BodyStates(
+        track.body,
+        problem.epochs.time_ns[rows],
+        track.T_world_body[rows],
+        track.velocity[rows],
+        angle,
+        sigma,
+        seen[rows],
+        track.own[rows],
+        common_part(track, found.P_zz)[rows],
+    )
+
+
+def _budget(problem: Problem, found: Marginals, track: BodyTrack, rows) -> dict:
+    """Median standard deviation of the elevation of the cutting edge's middle by source, m."""
+    if len(rows) == 0:
+        return {}
+    groups = {
+        source: np.concatenate(
+            [problem.statics.columns[k] for k, s in enumerate(problem.network.statics) if s.source == source]
+            or [np.array([], dtype=np.int64)]
+        )
+        for source in SOURCES
+    }
+    parts = vertical_budget(track, found.P_zz, groups, rows)
+    return {name: round(float(np.sqrt(np.median(variance))), 6) for name, variance in parts.items()}

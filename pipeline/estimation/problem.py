@@ -1,0 +1,324 @@
+"""The whole least-squares problem of one log, and its linearisation as an arrow.
+
+Variables that share an observation form one chain; chains are independent of each other given the statics, and so
+separate, smaller block-tridiagonal systems: two of 12 cost a quarter of one of 24.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.estimation import motion
+from pipeline.estimation.arrow import Chain
+from pipeline.estimation.residuals import (
+    Corners,
+    Jacobians,
+    SensorReadings,
+    corner_residuals,
+    measured_sigma,
+    sensor_residuals,
+)
+from pipeline.estimation.values import Statics, Values
+from pipeline.geometry import so3
+from pipeline.network import frames as fr
+from pipeline.network.datum import Tie
+from pipeline.network.epochs import Epochs
+from pipeline.network.model import Network
+
+FIRST_POSE = np.array([100.0] * 3 + [np.pi] * 3)
+FIRST_RATE = np.array([3.0] * 3 + [1.5] * 3)
+"""Prior sigmas of the first epoch's state about its start (m, rad) and about rest (m/s, rad/s): what every machine obeys.
+It holds what a log of one frame leaves free, and is worth nothing against a second frame."""
+LOST = 1e3
+"""Whitened length that a corner behind its camera, or a reading out of the linkage's reach, counts with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """Everything that does not change between iterations."""
+
+    network: Network
+    tie: Tie
+    epochs: Epochs
+    statics: Statics
+    corners: tuple[Corners, ...]
+    sensors: tuple[SensorReadings, ...]
+    chains: tuple[tuple[int, ...], ...]
+    """Variables of each chain, in the order of its state block."""
+    first: Values
+    """The start, about which the first epoch's weak prior stands."""
+    dt_s: np.ndarray
+    """(E - 1,)."""
+
+    def place(self, variable: int) -> tuple[int, slice]:
+        """The chain of a variable, and where its state stands in the chain's block."""
+        for c, members in enumerate(self.chains):
+            at = 0
+            for v in members:
+                size = self.tie.variables[v].size
+                if v == variable:
+                    return c, slice(at, at + size)
+                at += size
+        raise KeyError(variable)
+
+    def chain_size(self, chain: int) -> int:
+        return sum(self.tie.variables[v].size for v in self.chains[chain])
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """How much each measurement counts."""
+
+    huber: float
+    """Whitened length beyond which the loss grows linearly."""
+    corners: tuple[np.ndarray, ...]
+    """Per group: (n, 4) bool, False where the corner is a gross outlier."""
+    sensors: tuple[np.ndarray, ...]
+    """Per sensor: (n, 1) bool."""
+
+
+def problem_of(network: Network, tie: Tie, epochs: Epochs, statics: Statics, first: Values) -> Problem:
+    """Sort the observations into groups of one path each, and the variables into chains."""
+    seen = epochs.observations
+    marker_of = network.tag_marker[seen.tag]
+    corners = []
+    for c, camera in enumerate(network.cameras):
+        for m, marker in enumerate(network.markers):
+            rows = np.flatnonzero((seen.camera == c) & (marker_of == m))
+            if len(rows) == 0:
+                continue
+            rows = rows[np.argsort(epochs.epoch[rows], kind="stable")]
+            path = tie.frames.path(fr.camera_frame(camera.name), fr.marker_frame(marker.name))
+            corners.append(
+                Corners(
+                    c,
+                    m,
+                    path,
+                    camera.intrinsics,
+                    rows,
+                    epochs.epoch[rows],
+                    network.tag_corners[seen.tag[rows]],
+                    seen.uv[rows],
+                    np.linalg.inv(np.linalg.cholesky(seen.cov[rows])),
+                )
+            )
+    sensors = []
+    for s, data in sorted(epochs.sensors.items()):
+        sensor = network.sensors[s]
+        at = [k for k, v in enumerate(tie.variables) if v.kind == "joint" and v.body == sensor.joint]
+        if not at:
+            continue
+        order = np.argsort(data.epoch, kind="stable")
+        sigma = measured_sigma(sensor, statics.base[sensor.curve], data.raw)
+        sensors.append(
+            SensorReadings(sensor, at[0], data.epoch[order], data.dt_s[order], data.raw[order], sigma[order])
+        )
+    return Problem(
+        network,
+        tie,
+        epochs,
+        statics,
+        tuple(corners),
+        tuple(sensors),
+        _chains(len(tie.variables), corners),
+        first,
+        np.diff(epochs.time_s),
+    )
+
+
+def _chains(count: int, corners) -> tuple[tuple[int, ...], ...]:
+    leader = list(range(count))
+
+    def find(k):
+        while leader[k] != k:
+            k = leader[k]
+        return k
+
+    for group in corners:
+        met = [step.edge.index for step in group.path if step.edge.kind != "static"]
+        for k in met[1:]:
+            leader[find(k)] = find(met[0])
+    return tuple(
+        tuple(k for k in range(count) if find(k) == root) for root in range(count) if find(root) == root
+    )
+
+
+def keep_all(problem: Problem, huber: float) -> Weights:
+    return Weights(
+        huber,
+        tuple(np.ones((len(g.epoch), 4), dtype=bool) for g in problem.corners),
+        tuple(np.ones((len(s.epoch), 1), dtype=bool) for s in problem.sensors),
+    )
+
+
+def huber(length, k: float, alive):
+    """Weight and cost of whitened residuals of the given length.
+
+    Huber's loss, by re-weighting: weight ``min(1, k / length)``, cost ``length²/2`` below k and linear beyond.
+
+    Parameters
+    ----------
+    length : (...,) array
+        nan counts as lost: no weight, a large cost.
+    k : float
+    alive : (...,) bool array
+        Where False: neither weight nor cost.
+
+    Returns
+    -------
+    weight, cost : (...,) arrays
+    """
+    lost = np.isnan(length)
+    length = np.where(lost, LOST, length)
+    weight = np.where(alive & ~lost, k / np.maximum(length, k), 0.0)
+    cost = np.where(length <= k, 0.5 * length**2, k * (length - 0.5 * k))
+    return weight, np.where(alive, cost, 0.0)
+
+
+def lengths(r, group: int):
+    """Lengths of the whitened residuals of each corner (group = 2) or reading (group = 1): (n, m / group)."""
+    return np.linalg.norm(r.reshape(len(r), -1, group), axis=-1)
+
+
+def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
+    """Robust cost at every epoch, and that of the statics' priors.
+
+    Returns
+    -------
+    local : (E,) array
+        Corners and readings of the epoch, motion up to the next, and at the first epoch its weak prior.
+    prior : float
+    """
+    local = np.zeros(len(problem.epochs.time_ns))
+    for group, alive in zip(problem.corners, weights.corners, strict=True):
+        r, _ = corner_residuals(group, values, problem.statics, jacobians=False)
+        np.add.at(local, group.epoch, huber(lengths(r, 2), weights.huber, alive)[1].sum(axis=-1))
+    for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
+        r, _ = sensor_residuals(readings, values, problem.statics, jacobians=False)
+        np.add.at(local, readings.epoch, huber(lengths(r, 1), weights.huber, alive)[1].sum(axis=-1))
+    for k in range(len(problem.tie.variables)):
+        e, _, _ = motion_residual(problem, values, k, jacobians=False)
+        local[:-1] += 0.5 * np.sum(e**2, axis=-1)
+        local[0] += 0.5 * np.sum(_first(problem, values, k)[0] ** 2)
+    return local, 0.5 * float(values.z @ values.z)
+
+
+def linearise(problem: Problem, values: Values, weights: Weights):
+    """Normal equations at the given values, after re-weighting.
+
+    Returns
+    -------
+    chains : list of Chain
+    C : (p, p) array
+    g_z : (p,) array
+    """
+    E, p = len(problem.epochs.time_ns), problem.statics.size
+    columns = [_columns(problem, c) for c in range(len(problem.chains))]
+    chains = [
+        Chain(np.zeros((E, b, b)), np.zeros((E - 1, b, b)), np.zeros((E, b)), np.zeros((E, b, len(q))), q)
+        for b, q in zip(map(problem.chain_size, range(len(columns))), columns, strict=True)
+    ]
+    C, g_z = np.eye(p), values.z.copy()
+    for group, alive in zip(problem.corners, weights.corners, strict=True):
+        r, J = corner_residuals(group, values, problem.statics)
+        assert J is not None
+        weight, _ = huber(lengths(r, 2), weights.huber, alive)
+        _add(problem, chains, C, g_z, group.epoch, r, J, np.repeat(weight, 2, axis=1))
+    for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
+        r, J = sensor_residuals(readings, values, problem.statics)
+        assert J is not None
+        weight, _ = huber(lengths(r, 1), weights.huber, alive)
+        _add(problem, chains, C, g_z, readings.epoch, r, J, weight)
+    for k in range(len(problem.tie.variables)):
+        c, at = problem.place(k)
+        chain = chains[c]
+        e, J_1, J_2 = motion_residual(problem, values, k)
+        J_1t, J_2t = np.swapaxes(J_1, -1, -2), np.swapaxes(J_2, -1, -2)
+        chain.D[:-1, at, at] += J_1t @ J_1
+        chain.D[1:, at, at] += J_2t @ J_2
+        chain.A[:, at, at] += J_1t @ J_2
+        chain.g[:-1, at] += np.einsum("nij,nj->ni", J_1t, e)
+        chain.g[1:, at] += np.einsum("nij,nj->ni", J_2t, e)
+        e, J = _first(problem, values, k)
+        chain.D[0, at, at] += J.T @ J
+        chain.g[0, at] += J.T @ e
+    return chains, C, g_z
+
+
+def _columns(problem: Problem, chain: int):
+    """Statics that bear on a chain."""
+    met: set[int] = set()
+    for group in problem.corners:
+        moving = [s.edge.index for s in group.path if s.edge.kind != "static"]
+        if moving and moving[0] in problem.chains[chain]:
+            met.update(s.edge.index for s in group.path if s.edge.kind == "static")
+            met.add(group.intrinsics)
+    for readings in problem.sensors:
+        if readings.variable in problem.chains[chain]:
+            sensor = readings.sensor
+            met.update(
+                {sensor.curve, sensor.offset} | ({sensor.linkage} if sensor.linkage is not None else set())
+            )
+    parts = [problem.statics.columns[s] for s in sorted(met)]
+    return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
+
+
+def _add(problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, weight) -> None:
+    """Add one group of measurements, (n, m) residuals of weights (n, m) at rising epochs."""
+    use = weight > 0
+    r = np.where(use, r, 0.0)
+    n, m = r.shape
+    z = np.concatenate([problem.statics.columns[s] for s in J.statics]) if J.statics else np.array([], int)
+    J_z = np.concatenate(list(J.statics.values()), axis=-1) if J.statics else np.zeros((n, m, 0))
+    J_z = np.where(use[..., None], J_z, 0.0)
+    wJ_z = weight[..., None] * J_z
+    C[np.ix_(z, z)] += wJ_z.reshape(n * m, -1).T @ J_z.reshape(n * m, -1)
+    g_z[z] += wJ_z.reshape(n * m, -1).T @ r.ravel()
+    if not J.variables:
+        return
+    places = {k: problem.place(k) for k in J.variables}
+    chain = chains[next(iter(places.values()))[0]]
+    x = np.concatenate([np.arange(at.start, at.stop) for _, at in places.values()])
+    J_x = np.where(use[..., None], np.concatenate(list(J.variables.values()), axis=-1), 0.0)
+    wJ_xt = np.swapaxes(weight[..., None] * J_x, -1, -2)
+    starts = np.flatnonzero(np.r_[True, np.diff(epoch) > 0])
+    at = epoch[starts]
+
+    def per_epoch(blocks):
+        return np.add.reduceat(blocks, starts, axis=0)
+
+    chain.D[np.ix_(at, x, x)] += per_epoch(wJ_xt @ J_x)
+    chain.g[np.ix_(at, x)] += per_epoch((wJ_xt @ r[..., None])[..., 0])
+    if len(z):
+        chain.B[np.ix_(at, x, np.searchsorted(chain.columns, z))] += per_epoch(wJ_xt @ J_z)
+
+
+def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):
+    """Whitened motion residuals of one variable (E - 1, 2h), and their Jacobians by both states."""
+    variable = problem.tie.variables[k]
+    T, w, dt = values.pose[k], values.rate[k], problem.dt_s
+    residual = motion.pose_residual if variable.kind == "moving" else motion.angle_residual
+    e, J_1, J_2 = residual(T[:-1], w[:-1], T[1:], w[1:], dt, jacobians)
+    W, root = motion.whitening(dt), motion.root_density(variable.kind, variable.motion)
+    if not jacobians:
+        return motion.whiten(e, W, root), None, None
+    return motion.whiten(e, W, root), motion.whiten(J_1, W, root), motion.whiten(J_2, W, root)
+
+
+def _first(problem: Problem, values: Values, k: int):
+    """Weak prior of the first epoch's state: residual and Jacobian."""
+    T, T_start, w = values.pose[k][0], problem.first.pose[k][0], values.rate[k][0]
+    if problem.tie.variables[k].kind == "joint":
+        sigma = np.array([FIRST_POSE[-1], FIRST_RATE[-1]])
+        return np.array([T - T_start, w]) / sigma, np.diag(1 / sigma)
+    # In translation and rotation apart: the logarithm of a pose has a seam at pi, a chord has none.
+    sigma = np.concatenate([FIRST_POSE, FIRST_RATE])
+    R_t = T_start[:3, :3].T
+    turned = so3.log(R_t @ T[:3, :3])
+    e = np.concatenate([R_t @ (T[:3, 3] - T_start[:3, 3]), turned, w])
+    J = np.eye(12)
+    J[:3, :3] = R_t @ T[:3, :3]
+    J[3:6, 3:6] = so3.Jr_inv(turned)
+    return e / sigma, J / sigma[:, None]

@@ -1,0 +1,107 @@
+"""Columns of the tables ``states``, ``statics`` and ``residuals``, and the rows of detections as observations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.estimation.solution import BodyStates, CornerResiduals, StaticResult
+from pipeline.geometry import gaussian, so3
+from pipeline.network.model import Network, Observations, Readings
+
+Columns = dict[str, np.ndarray]
+
+ACCEPTED = "accepted"
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+_TRIANGLE = [f"{a}_{b}" for i, a in enumerate(_AXES) for b in _AXES[i:]]
+_CORNERS = range(4)
+
+
+def columns_of_states(states: BodyStates) -> Columns:
+    """Columns of the ``states`` table for one body."""
+    q = so3.to_quaternion(states.T_world_body[:, :3, :3])
+    columns = {"time_ns": states.time_ns, "body": np.full(len(states.time_ns), states.body, dtype=object)}
+    columns |= dict(zip(("x_m", "y_m", "z_m"), states.T_world_body[:, :3, 3].T, strict=True))
+    columns |= dict(zip(("qx", "qy", "qz", "qw"), q.T, strict=True))
+    columns |= dict(zip(("vx", "vy", "vz", "wx", "wy", "wz"), states.velocity.T, strict=True))
+    columns |= {"angle_rad": states.angle_rad, "seen": states.seen}
+    for part, cov in (("own", states.own), ("common", states.common)):
+        triangle = gaussian.upper_triangle(cov)
+        columns |= {f"{part}_{name}": triangle[:, k] for k, name in enumerate(_TRIANGLE)}
+    return columns
+
+
+def columns_of_statics(results: tuple[StaticResult, ...]) -> Columns:
+    """Columns of the ``statics`` table, one row per component."""
+    count = [len(r.components) for r in results]
+    columns: Columns = {
+        "quantity": np.repeat(np.array([r.quantity for r in results], dtype=object), count),
+        "source": np.repeat(np.array([r.source for r in results], dtype=object), count),
+        "component": np.array([c for r in results for c in r.components], dtype=object),
+        "unit": np.array([u for r in results for u in r.units], dtype=object),
+    }
+    for name in ("file_value", "value", "prior_sigma", "sigma", "shift_sigmas"):
+        columns[name] = np.concatenate([getattr(r, name) for r in results])
+    return columns
+
+
+def columns_of_residuals(network: Network, table: CornerResiduals) -> Columns:
+    """Columns of the ``residuals`` table."""
+    cameras = np.array([c.name for c in network.cameras], dtype=object)
+    markers = np.array([m.name for m in network.markers], dtype=object)
+    return {
+        "camera": cameras[table.camera],
+        "time_ns": table.time_ns,
+        "marker": markers[table.marker],
+        "tag_id": table.tag_id,
+        "corner": table.corner,
+        "residual_u": table.residual[:, 0],
+        "residual_v": table.residual[:, 1],
+        "sigma_px": table.sigma_px,
+        "normalised": table.normalised,
+        "weight": table.weight,
+    }
+
+
+def observations_of(network: Network, detections: Mapping[str, Mapping[str, np.ndarray]]) -> Observations:
+    """Accepted tags of the ``detections`` tables, one table per camera, as observations.
+
+    Tags that the network does not have are left out: detection has counted them as unknown.
+    """
+    parts = [Observations(*_EMPTY)]
+    for name, rows in detections.items():
+        index = network.tag_index(rows["family"], rows["tag_id"])
+        good = np.flatnonzero((rows["status"] == ACCEPTED) & (index >= 0))
+        uv = np.stack([np.stack([rows[f"u{k}"], rows[f"v{k}"]], axis=-1) for k in _CORNERS], axis=1)[good]
+        cov = np.stack(
+            [
+                np.stack(
+                    [rows[f"cov{k}_uu"], rows[f"cov{k}_uv"], rows[f"cov{k}_uv"], rows[f"cov{k}_vv"]], axis=-1
+                )
+                for k in _CORNERS
+            ],
+            axis=1,
+        )[good]
+        camera = np.full(len(good), network.camera_index(name))
+        parts.append(Observations(camera, index[good], rows["time_ns"][good], uv, cov.reshape(-1, 4, 2, 2)))
+    fields = ("camera", "tag", "time_ns", "uv", "cov")
+    return Observations(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
+
+
+def readings_of(sensors: Mapping[str, np.ndarray]) -> dict[str, Readings]:
+    """Rows of the ``sensors`` table by sensor."""
+    names = sensors["sensor"].astype(str)
+    return {
+        str(name): Readings(sensors["time_ns"][names == name], sensors["raw"][names == name])
+        for name in np.unique(names)
+    }
+
+
+_EMPTY = (
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros(0, np.int64),
+    np.zeros((0, 4, 2)),
+    np.zeros((0, 4, 2, 2)),
+)

@@ -1,0 +1,82 @@
+"""The point at which everything is linearised: states, statics, and how both are moved by a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.geometry import se3
+from pipeline.network import frames as fr
+from pipeline.network.model import Network
+from pipeline.network.start import Start
+
+
+@dataclass(frozen=True, eq=False)
+class Statics:
+    """Where each static's whitened unknowns stand in ``z``, and how to get from ``z`` to values."""
+
+    base: tuple[np.ndarray, ...]
+    """Prior mean of each: the file's value (for an unsurveyed pose the start)."""
+    is_pose: tuple[bool, ...]
+    scale: tuple[np.ndarray, ...]
+    """(n, r) each; r may be 0: exact."""
+    columns: tuple[np.ndarray, ...]
+    """(r,) each, their places in ``z``."""
+    size: int
+    """p, how many unknowns there are in all."""
+
+    def value(self, index: int, z):
+        """The static's value."""
+        correction = self.scale[index] @ z[self.columns[index]]
+        if not self.is_pose[index]:
+            return self.base[index] + correction
+        return (
+            self.base[index] if len(self.columns[index]) == 0 else se3.retract(self.base[index], correction)
+        )
+
+    def sensitivity(self, index: int, z):
+        """(n, r): change of the value, or right perturbation of the pose, by its unknowns."""
+        scale = self.scale[index]
+        if not self.is_pose[index] or scale.shape[1] == 0:
+            return scale
+        return se3.Jr(scale @ z[self.columns[index]]) @ scale
+
+
+def statics_of(network: Network, start: Start) -> Statics:
+    """The unknowns of all statics, in the network's order."""
+    scale = tuple(s.scale for s in network.statics)
+    ends = np.cumsum([0] + [m.shape[1] for m in scale])
+    columns = tuple(np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
+    return Statics(start.statics, tuple(s.is_pose for s in network.statics), scale, columns, int(ends[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Values:
+    """One value for every unknown."""
+
+    pose: tuple[np.ndarray, ...]
+    """Per variable: (E, 4, 4) or (E,)."""
+    rate: tuple[np.ndarray, ...]
+    """Per variable: (E, 6) or (E,)."""
+    z: np.ndarray
+    """(p,) whitened corrections of the statics."""
+
+    def retract(self, deltas, dz) -> Values:
+        """Moved by a step: per variable (E, 12) or (E, 2), and (p,)."""
+        pose, rate = [], []
+        for T, w, d in zip(self.pose, self.rate, deltas, strict=True):
+            if T.ndim == 3:
+                pose.append(se3.retract(T, d[:, :6]))
+                rate.append(w + d[:, 6:])
+            else:
+                pose.append(T + d[:, 0])
+                rate.append(w + d[:, 1])
+        return replace(self, pose=tuple(pose), rate=tuple(rate), z=self.z + dz)
+
+    def edge_pose(self, statics: Statics, edge: fr.Edge, epoch=slice(None)):
+        """``T_parent_child`` of an edge: (4, 4), or (n, 4, 4) at the given epochs."""
+        if edge.kind == "static":
+            return statics.value(edge.index, self.z)
+        value = self.pose[edge.index][epoch]
+        return value if edge.kind == "moving" else fr.turn(value)

@@ -1,0 +1,64 @@
+"""estimate: everything that was seen and read, adjusted at once; `states`, `statics`, `residuals`, solution.json."""
+
+from __future__ import annotations
+
+import datetime
+import logging
+import time
+
+from pipeline.estimation import adjust
+from pipeline.estimation.table import (
+    columns_of_residuals,
+    columns_of_states,
+    columns_of_statics,
+    observations_of,
+    readings_of,
+)
+from pipeline.network import network_of
+from pipeline.stages.job import Counts, Job, Progress
+
+logger = logging.getLogger(__name__)
+
+
+def run(job: Job, progress: Progress) -> Counts:
+    """Write the adjusted states, statics and residuals. Raises NetworkError, EstimationError, ConfigError."""
+    started = time.monotonic()
+    date = datetime.datetime.fromtimestamp(job.read_json("log.json")["start_ns"] / 1e9, datetime.UTC).date()
+    network = network_of(job.calibrated_machine(), job.site, date)
+    cameras = [name for name in job.parts("detections") if name in {c.name for c in network.cameras}]
+    observations = observations_of(
+        network, {name: job.read_table("detections", part=name) for name in cameras}
+    )
+    readings = readings_of(job.read_table("sensors"))
+    logger.info("adjusting %d tags and %d sensors", len(observations.camera), len(readings))
+    progress.total(1)
+    solution = adjust(network, observations, readings, job.site.estimation)
+    with job.table_writer("states") as writer:
+        for states in solution.states:
+            writer.write(columns_of_states(states))
+    job.write_table("statics", columns_of_statics(solution.statics))
+    job.write_table("residuals", columns_of_residuals(network, solution.residuals))
+    job.write_json("solution.json", solution.diagnostics)
+    progress.advance(1)
+    for sentence in solution.warnings:
+        progress.warn(sentence)
+    figures = solution.diagnostics
+    logger.info(
+        "adjusted %d epochs in %d iterations, %.1f s, sigma0 %s",
+        figures["epochs"],
+        figures["iterations"],
+        time.monotonic() - started,
+        figures["sigma0"],
+    )
+    return {
+        "epochs": figures["epochs"],
+        "tags": len(observations.camera),
+        "corners weighed down": int(
+            ((solution.residuals.weight > 0) & (solution.residuals.weight < 1)).sum()
+        ),
+        "corners rejected": int((solution.residuals.weight == 0).sum()),
+        "readings": {name: len(r.raw) for name, r in readings.items()},
+        "left out": figures["dropped"],
+        "iterations": figures["iterations"],
+        "sigma0": figures["sigma0"],
+    }
