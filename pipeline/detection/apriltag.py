@@ -13,12 +13,17 @@ import numpy as np
 import pyapriltags
 
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.noise import corner_covariance
+from pipeline.detection.noise import CELLS, corner_covariance
 
 PIXEL_ORIGIN = 0.5
 """Where AprilTag's library puts the centre of the top-left pixel; ours is 0."""
-CORNERS_FROM_LIBRARY = (1, 0, 3, 2)
-"""Our corners 0..3 (top-left, top-right, bottom-right, bottom-left of the print) among the library's."""
+CORNERS_AS_OPENCV_PRINTS = (1, 0, 3, 2)
+CORNERS_AS_APRILTAG_PRINTS = (3, 2, 1, 0)
+"""Our corners 0..3 (top-left, top-right, bottom-right, bottom-left of the print) among the library's.
+
+OpenCV draws the tags of the classic families upside down compared with the pictures that the AprilTag project hands
+out, and "the print" is OpenCV's. It has no tagStandard families: there the print is the project's own.
+"""
 
 
 @dataclass(frozen=True)
@@ -67,8 +72,10 @@ class TagFinder:
         """Every tag of the families in a picture, (H, W) uint8; which of them to believe is decided elsewhere."""
         rows = []
         for family, detector in self._detectors.items():
+            standard = family.startswith("tagStandard")
+            order = list(CORNERS_AS_APRILTAG_PRINTS if standard else CORNERS_AS_OPENCV_PRINTS)
             for tag in detector.detect(np.ascontiguousarray(grey)):
-                uv = tag.corners[list(CORNERS_FROM_LIBRARY)] - PIXEL_ORIGIN
+                uv = tag.corners[order] - PIXEL_ORIGIN
                 rows.append((family, int(tag.tag_id), uv, int(tag.hamming), float(tag.decision_margin)))
         # The library's order depends on its hash tables; equal bytes for equal pictures need one of our own.
         rows.sort(key=lambda row: (row[0], row[1], row[2].tolist()))
@@ -77,7 +84,7 @@ class TagFinder:
             family=np.array([row[0] for row in rows], object),
             tag_id=np.array([row[1] for row in rows], np.int32),
             uv=uv,
-            cov=corner_covariance(uv),
+            cov=corner_covariance(uv, np.array([CELLS[row[0]] for row in rows], int)),
             side_px=np.linalg.norm(np.roll(uv, -1, axis=1) - uv, axis=-1).mean(axis=1),
             hamming=np.array([row[3] for row in rows], np.int32),
             margin=np.array([row[4] for row in rows], float),
