@@ -127,11 +127,11 @@ def _file_findings(site: Site, source: Source) -> Iterator[Finding]:
     from pipeline.surface.shots import read_shots
 
     try:
-        shots = read_shots(files["checks"].path, site)
+        shots = read_shots(files["checks"].path, site.checks.order, site.grid.metres_per_unit)
     except PipelineError as error:
         yield Finding("error", str(error))
         return
-    yield Finding("ok", f"{files['checks'].name}: {len(shots.point)} check shots")
+    yield Finding("ok", f"{files['checks'].name}: {len(shots)} check shots")
 
 
 def _topic_findings(reader: LogReader, machine: Machine, seen: Seen) -> Iterator[Finding]:

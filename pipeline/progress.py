@@ -171,6 +171,8 @@ def count_words(counts: dict[str, Any]) -> list[str]:
     """Counts as people read them: "7,312 tags accepted", "verdict PASS", "41 rejected (border 3, low margin 38)"."""
     words = []
     for word, value in counts.items():
+        if not value and len(counts) > 1:
+            continue  # a line of noughts hides what matters; the manifest keeps them
         if isinstance(value, dict):
             reasons = [
                 f"{reason} {number:,}"
@@ -178,6 +180,8 @@ def count_words(counts: dict[str, Any]) -> list[str]:
                 if number
             ]
             total = sum(value.values())
+            if not total:
+                continue
             words.append(f"{total:,} {word}" + (f" ({', '.join(reasons)})" if reasons else ""))
         elif isinstance(value, bool) or not isinstance(value, int | float):
             words.append(f"{word} {value}")

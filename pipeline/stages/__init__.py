@@ -35,6 +35,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from pipeline import __version__
+
 if TYPE_CHECKING:
     from pipeline.stages.job import Job
 
@@ -96,6 +98,7 @@ def _surveying(job: Job) -> Settings:
 def _reporting(job: Job) -> Settings:
     # The page quotes both files and says where they came from, so any change in them is a change of the page.
     return {
+        "gradetrace": __version__,
         "log": job.log.name,
         "machine": job.machine.model_dump(mode="json"),
         "site": job.site.model_dump(mode="json"),

@@ -58,9 +58,10 @@ def plan(job: Job, stage: Stage) -> Plan:
         manifest = job.folder.manifest(needed)
         if manifest is not None:
             inputs.update(manifest.outputs)
-            # Counts and warnings are shown on the report: they are input as much as the tables are.
+            # The page shows these as well: they are its input as much as the tables are.
             if stage.name == "report":
-                inputs[f"{needed} counts"] = sha256_of([manifest.counts, manifest.warnings])
+                shown = [manifest.fingerprint, manifest.counts, manifest.warnings]
+                inputs[f"manifest of {needed}"] = sha256_of(shown)
     read = {name for needed in stage.needs for name in stage_named(needed).tables}
     schemas = {name: tables.read_schema(name).version for name in sorted(read | set(stage.tables))}
     return Plan(inputs, stage.settings(job), schemas)
