@@ -1,0 +1,312 @@
+"""Station and offset along an alignment of straight lines and arcs, there and back; grid metres.
+
+Stations run along the alignment from its start station; offsets are to the right of it, positive to the right when
+looking along increasing station. Before the first and after the last point the end tangents go on, so that a point
+out there has a station outside ``[start, end]`` and can be told from one inside.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.errors import SurfaceError
+
+# Consecutive points of a sweep lie together: one bounding circle rules out most elements for a chunk.
+_CHUNK = 4096
+_JOINT_TOLERANCE_M = 0.005
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Elements end to end; build it with `polyline` or `from_elements`."""
+
+    start: np.ndarray
+    """(m, 2) easting, northing of each element's start, metres."""
+    end: np.ndarray
+    """(m, 2) of each element's end."""
+    center: np.ndarray
+    """(m, 2) of the arc's centre; nan for a line."""
+    turn: np.ndarray
+    """(m,) -1 turns left (counter-clockwise), +1 turns right (clockwise), 0 is a straight line."""
+    station: np.ndarray
+    """(m + 1,) stations of the elements' borders, metres."""
+    name: str = ""
+
+    @property
+    def start_station(self) -> float:
+        return float(self.station[0])
+
+    @property
+    def end_station(self) -> float:
+        return float(self.station[-1])
+
+    @property
+    def length(self) -> float:
+        return self.end_station - self.start_station
+
+    def bounding_box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest easting, northing of the alignment, (2,) each, metres."""
+        count = max(2, int(self.length) + 2)
+        p = self.points(np.linspace(self.start_station, self.end_station, min(count, 20_000)), 0.0)
+        p = np.concatenate([p, self.start, self.end])
+        return p.min(axis=0), p.max(axis=0)
+
+    def points(self, station: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
+        """Easting and northing of points given by station and offset.
+
+        Parameters
+        ----------
+        station, offset : (...,) arrays
+            Metres; they broadcast. Stations outside the alignment lie on its end tangents.
+
+        Returns
+        -------
+        (..., 2) array
+            Grid metres.
+        """
+        station, offset = np.broadcast_arrays(np.asarray(station, float), np.asarray(offset, float))
+        element = np.clip(np.searchsorted(self.station, station, side="right") - 1, 0, len(self.turn) - 1)
+        along = station - self.station[element]
+        length = np.diff(self.station)[element]
+        # On an arc the end tangent goes on straight: walk the arc to its end, the rest along the tangent.
+        inside = np.clip(along, 0.0, length)
+        foot, direction = self._walk(element, inside)
+        foot = foot + (along - inside)[..., None] * direction
+        right = np.stack([direction[..., 1], -direction[..., 0]], axis=-1)
+        return foot + offset[..., None] * right
+
+    def station_offset(self, en: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Station and offset of points: those of the nearest point of the alignment.
+
+        Parameters
+        ----------
+        en : (..., 2) array
+            Easting, northing, grid metres.
+
+        Returns
+        -------
+        station, offset : (...,) arrays
+            Metres; offset is positive to the right.
+        """
+        en = np.asarray(en, dtype=np.float64)
+        flat = en.reshape(-1, 2)
+        station, offset = np.empty(len(flat)), np.empty(len(flat))
+        for begin in range(0, len(flat), _CHUNK):
+            rows = slice(begin, begin + _CHUNK)
+            station[rows], offset[rows] = self._nearest(flat[rows])
+        return station.reshape(en.shape[:-1]), offset.reshape(en.shape[:-1])
+
+    def directions(self, element: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Unit vectors (..., 2) along the alignment at lengths (...,) along elements (...,)."""
+        return self._walk(element, along)[1]
+
+    def _walk(self, element: np.ndarray, along: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Points and unit directions at lengths along elements; (..., 2) each."""
+        start, end, center = self.start[element], self.end[element], self.center[element]
+        turn = self.turn[element].astype(float)
+        length = np.diff(self.station)[element]
+        line_direction = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
+        foot = start + along[..., None] * line_direction
+        direction = line_direction
+        arc = turn != 0
+        if np.any(arc):
+            radial = start - center
+            radius = np.linalg.norm(radial, axis=-1)
+            sweep = np.where(
+                arc, -turn * along / np.where(arc, radius, 1.0), 0.0
+            )  # counter-clockwise positive
+            cos, sin = np.cos(sweep), np.sin(sweep)
+            turned = np.stack(
+                [cos * radial[..., 0] - sin * radial[..., 1], sin * radial[..., 0] + cos * radial[..., 1]],
+                axis=-1,
+            )
+            tangent = (
+                -turn[..., None]
+                * np.stack([-turned[..., 1], turned[..., 0]], axis=-1)
+                / np.where(arc, radius, 1.0)[..., None]
+            )
+            foot = np.where(arc[..., None], center + turned, foot)
+            direction = np.where(arc[..., None], tangent, direction)
+        assert length.shape == along.shape
+        return foot, direction
+
+    def _nearest(self, en: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Bounds on the distance of each element's middle circle rule out those that cannot be nearest.
+        center = 0.5 * (en.min(axis=0) + en.max(axis=0))
+        reach = np.max(np.linalg.norm(en - center, axis=1))
+        element_center, element_reach = self._circles()
+        distance = np.linalg.norm(element_center - center, axis=1)
+        nearest_possible = distance - element_reach - reach
+        # The end elements reach to infinity along their tangents.
+        nearest_possible[[0, -1]] = 0.0
+        surely_within = np.min(np.linalg.norm(self.start - center, axis=1)) + reach
+        candidates = np.flatnonzero(nearest_possible <= surely_within)
+
+        best = np.full(len(en), np.inf)
+        station, offset = np.empty(len(en)), np.empty(len(en))
+        for k in candidates:
+            along, foot, direction = self._foot(int(k), en)
+            away = en - foot
+            distance = np.hypot(away[:, 0], away[:, 1])
+            nearer = distance < best
+            best[nearer] = distance[nearer]
+            # At a corner the side is told by the bisector of both tangents; either one alone is wrong behind a
+            # corner sharper than 90 degrees.
+            side = away[:, 0] * direction[:, 1] - away[:, 1] * direction[:, 0]
+            station[nearer] = (self.station[k] + along)[nearer]
+            offset[nearer] = np.where(side < 0, -distance, distance)[nearer]
+        return station, offset
+
+    def _circles(self) -> tuple[np.ndarray, np.ndarray]:
+        length = np.diff(self.station)
+        middle, _ = self._walk(np.arange(len(self.turn)), 0.5 * length)
+        # No point of an element is further from its middle than half its length.
+        return middle, 0.5 * length
+
+    def _foot(self, k: int, en: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Nearest point of element k: length along it, point (n, 2), direction for telling the side (n, 2)."""
+        length = float(self.station[k + 1] - self.station[k])
+        first, last = k == 0, k == len(self.turn) - 1
+        ends, tangents = self._walk(np.array([k, k]), np.array([0.0, length]))
+        before = (en - ends[0]) @ tangents[0]
+        after = (en - ends[1]) @ tangents[1]
+        if self.turn[k] == 0:
+            along = before
+        else:
+            radial = en - self.center[k]
+            start = self.start[k] - self.center[k]
+            radius = float(np.hypot(*start))
+            swept = np.arctan2(start[0] * radial[:, 1] - start[1] * radial[:, 0], radial @ start) * -float(
+                self.turn[k]
+            )
+            total = length / radius
+            # The angle is only known modulo a turn: take the one nearest to the arc's middle.
+            swept = swept - 2 * np.pi * np.round((swept - 0.5 * total) / (2 * np.pi))
+            along = swept * radius
+            # Off an arc's end the tangent extension decides, not the angle about the centre.
+            if first:
+                along = np.where(along < 0, np.minimum(before, 0.0), along)
+            if last:
+                along = np.where(along > length, length + np.maximum(after, 0.0), along)
+        low, high = (-np.inf if first else 0.0), (np.inf if last else length)
+        clamped = np.clip(along, low, high)
+        foot, direction = self._walk(np.full(len(en), k), np.clip(clamped, 0.0, length))
+        beyond = clamped - np.clip(clamped, 0.0, length)
+        foot = foot + beyond[:, None] * direction
+        if not first:
+            direction = np.where(
+                (along <= 0.0)[:, None], tangents[0] + self._tangent(k - 1, at_end=True), direction
+            )
+        if not last:
+            direction = np.where(
+                (along >= length)[:, None], tangents[1] + self._tangent(k + 1, at_end=False), direction
+            )
+        return clamped, foot, direction
+
+    def _tangent(self, k: int, at_end: bool) -> np.ndarray:
+        along = float(self.station[k + 1] - self.station[k]) if at_end else 0.0
+        return self._walk(np.array([k]), np.array([along]))[1][0]
+
+
+def polyline(points_en: np.ndarray, start_station_m: float = 0.0, name: str = "") -> Alignment:
+    """Alignment through points by straight lines.
+
+    Parameters
+    ----------
+    points_en : (n, 2) array
+        Easting, northing, grid metres; n >= 2.
+    start_station_m : float
+        Station of the first point.
+    name : str
+        For messages.
+
+    Raises
+    ------
+    SurfaceError
+        When two successive points are the same.
+    """
+    points = np.asarray(points_en, dtype=np.float64)
+    length = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    if np.any(length < 1e-6):
+        k = int(np.argmin(length))
+        raise SurfaceError(
+            f"alignment {name or 'of site.toml'}: points {k + 1} and {k + 2} are the same; remove one of them"
+        )
+    m = len(length)
+    return Alignment(
+        start=points[:-1],
+        end=points[1:],
+        center=np.full((m, 2), np.nan),
+        turn=np.zeros(m, dtype=np.int8),
+        station=start_station_m + np.concatenate([[0.0], np.cumsum(length)]),
+        name=name,
+    )
+
+
+def from_elements(
+    start: np.ndarray,
+    end: np.ndarray,
+    center: np.ndarray,
+    turn: np.ndarray,
+    start_station_m: float,
+    name: str,
+    tolerance_m: float = _JOINT_TOLERANCE_M,
+) -> Alignment:
+    """Alignment of lines and arcs given by their points.
+
+    Parameters
+    ----------
+    start, end, center : (m, 2) arrays
+        Grid metres; center is nan for a line.
+    turn : (m,) array
+        -1 left, +1 right, 0 line.
+    start_station_m : float
+        Station of the first element's start.
+    name : str
+        For messages.
+    tolerance_m : float
+        How far an element may start from the end of the one before, and an arc's two radii may differ.
+
+    Raises
+    ------
+    SurfaceError
+        When elements do not join, an arc's end is not on its circle, or an element has no length.
+    """
+    start, end, center = (np.asarray(a, dtype=np.float64).reshape(-1, 2) for a in (start, end, center))
+    turn = np.asarray(turn, dtype=np.int8)
+    gap = np.linalg.norm(start[1:] - end[:-1], axis=1)
+    if np.any(gap > tolerance_m):
+        k = int(np.argmax(gap))
+        raise SurfaceError(
+            f"alignment '{name}': element {k + 2} starts {gap[k]:.3f} m from the end of element {k + 1}; "
+            "export it again as one chain"
+        )
+    chord = np.linalg.norm(end - start, axis=1)
+    arc = turn != 0
+    radius = np.where(arc, np.linalg.norm(start - center, axis=1), np.nan)
+    other = np.where(arc, np.linalg.norm(end - center, axis=1), np.nan)
+    if np.any(np.abs(radius - other)[arc] > tolerance_m):
+        k = int(np.flatnonzero(arc)[np.argmax(np.abs(radius - other)[arc])])
+        raise SurfaceError(
+            f"alignment '{name}': the start and the end of arc {k + 1} are {radius[k]:.3f} m and {other[k]:.3f} m "
+            "from its centre; export it again"
+        )
+    if np.any(chord < 1e-9):
+        raise SurfaceError(
+            f"alignment '{name}': element {int(np.argmin(chord)) + 1} has no length; remove it"
+        )
+    a, b = start - center, end - center
+    # Counter-clockwise angle from start to end in [0, 2 pi), then the way round that the arc says.
+    angle = np.mod(np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)), 2 * np.pi)
+    angle = np.where(turn > 0, 2 * np.pi - angle, angle)
+    length = np.where(arc, radius * angle, chord)
+    return Alignment(
+        start=start,
+        end=end,
+        center=center,
+        turn=turn,
+        station=start_station_m + np.concatenate([[0.0], np.cumsum(length)]),
+        name=name,
+    )

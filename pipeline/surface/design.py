@@ -1,0 +1,408 @@
+"""The trench as designed: elevation and floor over station and offset, from a CSV profile or a LandXML surface.
+
+What the **floor** is: for a profile, everything within half the floor width of the alignment. A triangulated surface
+does not say; there the floor is made of the faces no steeper than `FLOOR_SLOPE` that hang together, edge by edge,
+with such faces under the alignment. Walls, slopes and the ground beside the trench, which flat faces
+cannot reach across a wall, are thereby left out. Where no face under the alignment is that flat (a ditch in the
+shape of a V), the whole surface counts as floor, and the report says so.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+import shapely
+
+from pipeline.config.site import METRES_PER_UNIT, Site
+from pipeline.errors import SurfaceError
+from pipeline.surface.alignment import Alignment, from_elements, polyline
+from pipeline.surface.landxml import LandXml, TinSurface, XmlAlignment, read_landxml
+
+FLOOR_SLOPE = 0.2
+"""Rise per run. Pipes and trench floors stay under 0.1; the flattest side slopes that are cut are 0.25 (1 in 4)."""
+NEAR_M = 50_000.0
+"""A design further than this from the world's origin belongs to another job, or has its axes or unit wrong."""
+NEAR_ELEVATION_M = 1_000.0
+PROFILE_COLUMNS = ("station", "elevation", "width", "side_slope")
+MAX_PROFILE_ROWS = 1_000_000
+_QUERY = 262_144
+
+
+class Design(Protocol):
+    """What the rest of the room asks of a design; stations, offsets and elevations in metres."""
+
+    @property
+    def name(self) -> str:
+        """Surface or file."""
+
+    def elevation(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Design elevation; nan outside the design."""
+
+    def is_floor(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        """Whether a place belongs to the trench floor."""
+
+    def floor_level(self, station: np.ndarray) -> np.ndarray:
+        """Level of the floor at stations, also beside the trench; nan where there is no design."""
+
+    def station_range(self) -> tuple[float, float]:
+        """First and last station of the design on the alignment."""
+
+    def floor_reach(self) -> float:
+        """Largest distance of the floor from the alignment."""
+
+
+@dataclass(frozen=True)
+class ProfileDesign:
+    """A trench by station: floor elevation, floor width, side slope; linear between rows."""
+
+    name: str
+    station: np.ndarray
+    """(n,) ascending, metres."""
+    floor: np.ndarray
+    """(n,) elevation, metres."""
+    width: np.ndarray
+    """(n,) of the floor, centred on the alignment, metres."""
+    side_slope: np.ndarray
+    """(n,) run per rise; 0 is a vertical wall, and the design then ends at the foot of the wall."""
+
+    def elevation(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        station, offset = np.broadcast_arrays(np.asarray(station, float), np.asarray(offset, float))
+        beyond = np.abs(offset) - 0.5 * self._at(station, self.width)
+        run_per_rise = self._at(station, self.side_slope)
+        sloped = run_per_rise > 0
+        rise = np.where(sloped, np.maximum(beyond, 0.0) / np.where(sloped, run_per_rise, 1.0), 0.0)
+        return np.where((beyond > 0) & ~sloped, np.nan, self.floor_level(station) + rise)
+
+    def is_floor(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        return np.abs(offset) <= 0.5 * self._at(station, self.width)
+
+    def floor_level(self, station: np.ndarray) -> np.ndarray:
+        return self._at(np.asarray(station, float), self.floor)
+
+    def station_range(self) -> tuple[float, float]:
+        return float(self.station[0]), float(self.station[-1])
+
+    def floor_reach(self) -> float:
+        return 0.5 * float(self.width.max())
+
+    def _at(self, station: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return np.interp(station, self.station, values, left=np.nan, right=np.nan)
+
+
+class TinDesign:
+    """A triangulated surface seen along an alignment."""
+
+    def __init__(self, name: str, points: np.ndarray, faces: np.ndarray, alignment: Alignment):
+        """Surface of `points` (n, 3) in grid metres and `faces` (m, 3)."""
+        self.name = name
+        self.points = points
+        corners = points[faces]
+        normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        plan = np.abs(normal[:, 2])
+        # Vertical faces have no plan area, so no elevation to give.
+        level = plan > 1e-12 + 1e-9 * np.linalg.norm(normal, axis=1)
+        self.faces = faces[level]
+        self._corners = corners[level]
+        self._slope = np.hypot(normal[level, 0], normal[level, 1]) / plan[level]
+        self._alignment = alignment
+        self._tree = shapely.STRtree(
+            shapely.box(*self._corners[:, :, :2].min(axis=1).T, *self._corners[:, :, :2].max(axis=1).T)
+        )
+        self._station = np.arange(alignment.start_station, alignment.end_station + 0.25, 0.25)
+        on_axis, face = self._find(alignment.points(self._station, 0.0))
+        if not np.any(face >= 0):
+            raise SurfaceError(
+                f"design surface '{name}' does not lie under the alignment anywhere; "
+                "mend design.surface or the alignment in site.toml"
+            )
+        self.floor_faces, self.floor_is_whole = _connected_floor(self.faces, self._slope, face)
+        self._axis_level = self._level_along(on_axis, face)
+
+    def elevation(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        station, offset = np.broadcast_arrays(np.asarray(station, float), np.asarray(offset, float))
+        return self.elevation_at(self._alignment.points(station, offset))
+
+    def elevation_at(self, en: np.ndarray) -> np.ndarray:
+        """Elevation (...) at easting, northing (..., 2); the lowest face where several lie above each other."""
+        return self._find(en.reshape(-1, 2))[0].reshape(en.shape[:-1])
+
+    def is_floor(self, station: np.ndarray, offset: np.ndarray) -> np.ndarray:
+        station, offset = np.broadcast_arrays(np.asarray(station, float), np.asarray(offset, float))
+        face = self._find(self._alignment.points(station, offset).reshape(-1, 2))[1]
+        return np.where(face >= 0, self.floor_faces[face], False).reshape(station.shape)
+
+    def floor_level(self, station: np.ndarray) -> np.ndarray:
+        return np.interp(station, self._station, self._axis_level, left=np.nan, right=np.nan)
+
+    def station_range(self) -> tuple[float, float]:
+        there = self._station[np.isfinite(self._axis_level)]
+        return float(there[0]), float(there[-1])
+
+    def floor_reach(self) -> float:
+        corners = self._corners[self.floor_faces][:, :, :2].reshape(-1, 2)
+        station, offset = self._alignment.station_offset(corners)
+        near = (station > self._alignment.start_station - 1) & (station < self._alignment.end_station + 1)
+        return float(np.max(np.abs(offset[near]), initial=0.0))
+
+    def _level_along(self, on_axis: np.ndarray, face: np.ndarray) -> np.ndarray:
+        return np.where((face >= 0) & self.floor_faces[face], on_axis, np.nan)
+
+    def _find(self, en: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Elevation and face of points (n, 2); nan and -1 outside."""
+        elevation, found = np.full(len(en), np.inf), np.full(len(en), -1)
+        for begin in range(0, len(en), _QUERY):
+            part = en[begin : begin + _QUERY]
+            point, face = self._tree.query(shapely.points(part))
+            a, b, c = (self._corners[face, i] for i in range(3))
+            p = part[point]
+            u, v, w = b[:, :2] - a[:, :2], c[:, :2] - a[:, :2], p - a[:, :2]
+            area = u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]
+            beta = (w[:, 0] * v[:, 1] - w[:, 1] * v[:, 0]) / area
+            gamma = (u[:, 0] * w[:, 1] - u[:, 1] * w[:, 0]) / area
+            # A point on a shared edge must not fall between two faces for the sake of rounding.
+            inside = (beta >= -1e-9) & (gamma >= -1e-9) & (beta + gamma <= 1 + 1e-9)
+            h = a[:, 2] + beta * (b[:, 2] - a[:, 2]) + gamma * (c[:, 2] - a[:, 2])
+            point, face, h = point[inside], face[inside], h[inside]
+            # Highest first, so that the lowest is written last and stays.
+            order = np.lexsort((-face, -h))
+            elevation[begin + point[order]] = h[order]
+            found[begin + point[order]] = face[order]
+        return np.where(found >= 0, elevation, np.nan), found
+
+
+def _connected_floor(faces: np.ndarray, slope: np.ndarray, on_axis: np.ndarray) -> tuple[np.ndarray, bool]:
+    """(m,) bool: which faces are floor; and whether that is the whole surface for want of flat ones."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    flat = slope <= FLOOR_SLOPE
+    seeds = np.unique(on_axis[on_axis >= 0])
+    seeds = seeds[flat[seeds]]
+    if len(seeds) == 0:
+        return np.ones(len(faces), dtype=bool), True
+    edges = np.sort(faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
+    owner = np.repeat(np.arange(len(faces)), 3)
+    order = np.lexsort((edges[:, 1], edges[:, 0]))
+    edges, owner = edges[order], owner[order]
+    same = np.all(edges[1:] == edges[:-1], axis=1) & flat[owner[1:]] & flat[owner[:-1]]
+    one, other = owner[:-1][same], owner[1:][same]
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(len(faces), len(faces)))
+    _, label = connected_components(graph, directed=False)
+    return flat & np.isin(label, label[seeds]), False
+
+
+def floor_sentence(design: Design) -> str:
+    """What counts as the floor of this design, in words, for the report."""
+    if not isinstance(design, TinDesign):
+        return "The floor is everything within half the designed floor width of the alignment."
+    if design.floor_is_whole:
+        return (
+            f"No face of the design surface under the alignment is flatter than {FLOOR_SLOPE:g} (rise per run), so the "
+            "whole surface counts as floor."
+        )
+    return (
+        f"The floor is made of the faces of the design surface no steeper than {FLOOR_SLOPE:g} (rise per run) that "
+        "hang together with such faces under the alignment."
+    )
+
+
+def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
+    """The design and the alignment of a site, in grid metres, checked against the site's origin.
+
+    Parameters
+    ----------
+    path : Path
+        The file that ``design.file`` names.
+    site : Site
+        Its grid, alignment and design.
+
+    Raises
+    ------
+    SurfaceError
+        The file cannot be used, or design, alignment and origin do not belong together.
+    """
+    scale = site.grid.metres_per_unit
+    origin_m = site.grid.to_grid_metres(np.zeros(3))
+    landxml: LandXml | None = None
+    if site.design.kind == "landxml":
+        landxml = read_landxml(path)
+        check_unit(landxml, site.grid.unit)
+    if site.alignment is not None:
+        alignment = polyline(np.array(site.alignment.points) * scale, site.alignment.start_station * scale)
+        where = "the alignment in site.toml"
+    else:
+        assert landxml is not None
+        alignment = alignment_of(landxml.alignment(site.design.alignment), landxml.source, scale)
+        where = f"{path.name}: alignment '{alignment.name}'"
+    check_near(alignment.points(alignment.station, 0.0), origin_m[:2], site.grid.unit, where)
+    design: Design
+    if landxml is not None:
+        surface = landxml.surface(site.design.surface)
+        design = tin_of(surface, landxml.source, alignment, site)
+    else:
+        design = read_profile(path, scale)
+    first, last = design.station_range()
+    if last <= alignment.start_station or first >= alignment.end_station:
+        raise SurfaceError(
+            f"{path.name}: the design runs from station {first / scale:.2f} to {last / scale:.2f}, the alignment from "
+            f"{alignment.start_station / scale:.2f} to {alignment.end_station / scale:.2f}; they do not meet: mend "
+            "alignment.start_station or the stations of the design"
+        )
+    level = design.floor_level(np.linspace(first, last, 50))
+    check_elevation(level, origin_m[2], path.name, scale)
+    return design, alignment
+
+
+def check_unit(landxml: LandXml, unit: str) -> None:
+    """Raise SurfaceError unless the file is in the grid's unit."""
+    if landxml.unit != unit:
+        written = f"'{landxml.unit_as_written}'" if landxml.unit_as_written else "not stated"
+        raise SurfaceError(
+            f"{landxml.source}: its unit is {written}, but grid.unit in site.toml is '{unit}'; "
+            "export the design in the unit of the grid, or mend grid.unit"
+        )
+
+
+def check_near(en: np.ndarray, origin_en: np.ndarray, unit: str, where: str) -> None:
+    """Raise SurfaceError, with the likely cause, where points lie far from the world's origin; grid metres."""
+    center = 0.5 * (en.min(axis=0) + en.max(axis=0))
+    away = float(np.linalg.norm(center - origin_en))
+    if away <= NEAR_M:
+        return
+    own = METRES_PER_UNIT[unit]
+    cause = "is it the design of another job, or is grid.origin wrong?"
+    if np.linalg.norm(center[::-1] - origin_en) <= NEAR_M:
+        cause = "northing and easting look swapped: mend their order"
+    else:
+        for other, metres in METRES_PER_UNIT.items():
+            if other != unit and np.linalg.norm(center * metres / own - origin_en) <= NEAR_M:
+                cause = f"its coordinates look like '{other}': export them in '{unit}', the unit of the grid"
+                break
+    raise SurfaceError(
+        f"{where}: lies around E {center[0] / own:.1f} N {center[1] / own:.1f}, {away / 1000:.0f} km from grid.origin "
+        f"(E {origin_en[0] / own:.0f} N {origin_en[1] / own:.0f}, {unit}); {cause}"
+    )
+
+
+def check_elevation(level: np.ndarray, origin_h: float, source: str, scale: float) -> None:
+    """Raise SurfaceError where the floor lies far above or below the world's origin; metres."""
+    away = float(np.nanmedian(level)) - origin_h
+    if abs(away) > NEAR_ELEVATION_M:
+        raise SurfaceError(
+            f"{source}: the design floor lies at {float(np.nanmedian(level)) / scale:.2f}, {abs(away):.0f} m from the "
+            f"elevation of grid.origin ({origin_h / scale:.0f}); check the unit and the height datum"
+        )
+
+
+def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
+    """The alignment of a LandXML file in grid metres. Raises SurfaceError for what cannot be followed."""
+    where = f"{source}: alignment '{element.name}'"
+    foreign = sorted({e.kind for e in element.elements} - {"Line", "Curve"})
+    if foreign:
+        raise SurfaceError(
+            f"{where} has elements of kind {', '.join(foreign)}; lines and arcs are understood: "
+            "export it with them, or give [alignment] points in site.toml"
+        )
+    if element.equations:
+        raise SurfaceError(
+            f"{where} has station equations, so its stations jump; export it with continuous stations"
+        )
+    if any(e.kind == "Curve" and e.center is None for e in element.elements):
+        raise SurfaceError(f"{where} has an arc without Center; export it with centres")
+    nowhere = (np.nan, np.nan)
+    alignment = from_elements(
+        np.array([e.start for e in element.elements]) * scale,
+        np.array([e.end for e in element.elements]) * scale,
+        np.array([e.center if e.kind == "Curve" and e.center else nowhere for e in element.elements]) * scale,
+        np.array([0 if e.kind == "Line" else (1 if e.clockwise else -1) for e in element.elements]),
+        element.start_station * scale,
+        element.name,
+    )
+    if element.stated_length is not None and abs(alignment.length - element.stated_length * scale) > 0.05:
+        raise SurfaceError(
+            f"{where}: its elements are {alignment.length / scale:.3f} long, the file says "
+            f"{element.stated_length:.3f}; export it again"
+        )
+    return alignment
+
+
+def tin_of(surface: TinSurface, source: str, alignment: Alignment, site: Site) -> TinDesign:
+    """A LandXML surface as a design in grid metres. Raises SurfaceError where it lies elsewhere."""
+    points = surface.points * site.grid.metres_per_unit
+    origin_m = site.grid.to_grid_metres(np.zeros(3))
+    check_near(points[:, :2], origin_m[:2], site.grid.unit, f"{source}: surface '{surface.name}'")
+    return TinDesign(surface.name or source, points, surface.faces, alignment)
+
+
+def read_profile(path: Path, metres_per_unit: float) -> ProfileDesign:
+    """A design of the columns station, elevation, width, side_slope; further columns are passed over.
+
+    Raises
+    ------
+    SurfaceError
+        Names file, line and column.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise SurfaceError(f"{path.name}: no such file beside site.toml; put the design there") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise SurfaceError(f"{path.name}: cannot be read as UTF-8 text ({error})") from None
+    header = next((line for line in text.splitlines() if line.strip()), "")
+    delimiter = max(",;\t", key=header.count)
+    rows = csv.reader(io.StringIO(text), delimiter=delimiter)
+    names: list[str] | None = None
+    values: list[list[float]] = []
+    try:
+        for row in rows:
+            cells = [cell.strip() for cell in row]
+            if not any(cells) or cells[0].startswith("#"):
+                continue
+            if names is None:
+                names = [cell.lower() for cell in cells]
+                missing = [name for name in PROFILE_COLUMNS if name not in names]
+                if missing:
+                    raise SurfaceError(
+                        f"{path.name}:{rows.line_num}: the first line must name the columns "
+                        f"{', '.join(PROFILE_COLUMNS)}; missing: {', '.join(missing)}"
+                    )
+                continue
+            values.append(_profile_row(cells, names, f"{path.name}:{rows.line_num}"))
+            if len(values) > MAX_PROFILE_ROWS:
+                raise SurfaceError(f"{path.name}: more than {MAX_PROFILE_ROWS} rows; thin the profile out")
+    except csv.Error as error:
+        raise SurfaceError(f"{path.name}:{rows.line_num}: not readable as CSV ({error})") from None
+    if len(values) < 2:
+        raise SurfaceError(
+            f"{path.name}: holds {len(values)} rows of the design; at least two stations are needed"
+        )
+    table = np.array(values)
+    bad = np.flatnonzero(np.diff(table[:, 0]) <= 0)
+    if len(bad):
+        raise SurfaceError(
+            f"{path.name}: stations must grow from row to row; {table[bad[0] + 1, 0]:g} follows {table[bad[0], 0]:g}"
+        )
+    if np.any(table[:, 2] <= 0) or np.any(table[:, 3] < 0):
+        raise SurfaceError(f"{path.name}: width must be positive and side_slope must not be negative")
+    metres = table[:, :3] * metres_per_unit
+    return ProfileDesign(path.name, metres[:, 0], metres[:, 1], metres[:, 2], table[:, 3])
+
+
+def _profile_row(cells: list[str], names: list[str], where: str) -> list[float]:
+    numbers = []
+    for name in PROFILE_COLUMNS:
+        column = names.index(name)
+        text = cells[column] if column < len(cells) else ""
+        try:
+            number = float(text)
+        except ValueError:
+            number = np.nan
+        if not np.isfinite(number):
+            raise SurfaceError(f"{where}: {name}: expected a number, found '{text}'")
+        numbers.append(number)
+    return numbers
