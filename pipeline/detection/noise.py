@@ -81,8 +81,9 @@ def corner_covariance(uv: np.ndarray, cells: np.ndarray | int, noise: EdgeNoise 
     along = along / length[..., None]
     normal = np.stack([-along[..., 1], along[..., 0]], axis=-1)
     width = widths_across(uv) / np.broadcast_to(np.asarray(cells, float)[..., None], length.shape)
-    cosine = np.einsum("...i,...i->...", np.roll(along, 1, axis=1), along)
-    sine = np.sqrt(np.maximum(1 - cosine**2, 0))
+    before = np.roll(along, 1, axis=1)
+    cosine = np.einsum("...i,...i->...", before, along)
+    sine = np.abs(before[..., 0] * along[..., 1] - before[..., 1] * along[..., 0])
     flat = sine < 0.1
     cotangent = np.abs(cosine) / np.maximum(sine, 0.1)
 

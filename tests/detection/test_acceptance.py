@@ -1,0 +1,58 @@
+import numpy as np
+
+from pipeline.config.site import DetectionSettings
+from pipeline.detection.acceptance import judge
+from pipeline.detection.apriltag import Found
+
+SQUARE = np.array([[0, 0], [30, 0], [30, 30], [0, 30.0]])
+SETTINGS = DetectionSettings()
+
+
+def found(*tags):
+    """Tags as (id, left, top) with optional hamming, margin, scale."""
+    rows = [{"hamming": 0, "margin": 60.0, "scale": 1.0, **(tag[3] if len(tag) > 3 else {})} for tag in tags]
+    uv = np.array([SQUARE * row["scale"] + tag[1:3] for tag, row in zip(tags, rows)])
+    return Found(
+        family=np.full(len(tags), "tag36h11", object),
+        tag_id=np.array([tag[0] for tag in tags]),
+        uv=uv,
+        cov=np.tile(np.eye(2), (len(tags), 4, 1, 1)),
+        side_px=np.full(len(tags), 30.0),
+        hamming=np.array([row["hamming"] for row in rows]),
+        margin=np.array([row["margin"] for row in rows]),
+    )
+
+
+def statuses(*tags):
+    return judge(found(*tags), {"tag36h11": {1, 2, 3}}, (480, 640), SETTINGS).tolist()
+
+
+def test_each_reason_is_told():
+    assert statuses(
+        (1, 100, 100),
+        (7, 200, 100),
+        (2, 1.9, 200),
+        (3, 300, 300, {"margin": 19.0}),
+    ) == ["accepted", "unknown id", "border", "low margin"]
+    assert statuses((1, 100, 100, {"hamming": 2})) == ["bit errors"]
+    assert statuses((1, 100, 100, {"scale": 0.2})) == ["too small"]
+
+
+def test_the_border_is_felt_on_all_four_sides():
+    assert statuses((1, 608, 100), (2, 607, 100), (3, 100, 448)) == ["border", "accepted", "border"]
+
+
+def test_two_of_one_id_are_both_refused():
+    assert statuses((1, 100, 100), (1, 300, 100), (2, 200, 200)) == [
+        "twice in one frame",
+        "twice in one frame",
+        "accepted",
+    ]
+
+
+def test_a_poor_decoding_does_not_take_a_good_one_with_it():
+    assert statuses((1, 100, 100), (1, 300, 100, {"margin": 5.0})) == ["accepted", "low margin"]
+
+
+def test_an_id_of_another_family_is_unknown():
+    assert judge(found((1, 100, 100)), {"tag25h9": {1}}, (480, 640), SETTINGS).tolist() == ["unknown id"]
