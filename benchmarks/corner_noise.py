@@ -96,7 +96,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--trials", type=int, default=50, help="views per cell (default 50)")
+    parser.add_argument("--trials", type=int, default=120, help="views per cell (default 120)")
     parser.add_argument("--family", default="tag36h11", choices=sorted(IDS))
     parser.add_argument("--seed", type=int, default=11)
     options = parser.parse_args()

@@ -33,7 +33,7 @@ def both(folder, log, **options):
 
 
 def test_a_sound_log_gives_its_tables_and_no_warning(shift, tmp_path):
-    job = open_job(tmp_path, shift) if False else open_job(shift.parent, shift, runs=str(tmp_path))
+    job = open_job(shift.parent, shift, runs=str(tmp_path))
     counts, watch = ingested(job)
     assert watch.warnings == []
     assert watch.done == watch.expected == 160
@@ -213,15 +213,4 @@ def test_a_cut_log_is_searched_as_far_as_it_goes_and_says_so(shift, tmp_path):
     assert any("breaks off" in warning and " s at its end are lost" in warning for warning in watch.warnings)
     recovery = json.loads(job.folder.file("log.json").read_text())["recovery"]
     assert 0 < recovery["lost_seconds"] < 15
-    assert detected(job)[0]["frames"] == {"searched": 2 * counts["frames"]["front"]} or True
-
-
-def test_results_do_not_depend_on_the_number_of_workers(shift, tmp_path):
-    contents = []
-    for workers in (1, 2):
-        job = open_job(shift.parent, shift, runs=str(tmp_path / str(workers)), workers=workers)
-        ingested(job)
-        detected(job)
-        contents.append({p.name: p.read_bytes() for p in sorted(job.folder.path.glob("*/*.parquet"))})
-    assert contents[0] == contents[1]
-    assert list(contents[0]) == ["front.parquet", "side.parquet"]
+    assert detected(job)[0]["frames"] == {"searched": sum(counts["frames"].values())}
