@@ -28,6 +28,8 @@ SECTION_OF_STAGE = {
     "track": "coverage",
     "survey": "stations",
 }
+MOST_OF_ONE_SECTION = 2
+"""Among the five: ten sensors that moved must not hide that the trench fails."""
 
 
 @dataclass(frozen=True)
@@ -62,31 +64,40 @@ def attention(
     seen: dict[str, Remark] = {}
     for remark in sorted(remarks, key=lambda r: r.grade):  # stable: the order above within a grade
         seen.setdefault(remark.sentence, remark)
-    listed = [
-        {"sentence": r.sentence, "section": r.section, "heading": words(f"sections.{r.section}")}
-        for r in seen.values()
-    ]
-    return {"items": listed[:SHOWN], "more": listed[SHOWN:]}
+    first: list[Remark] = []
+    for remark in seen.values():
+        if len(first) < SHOWN and sum(r.section == remark.section for r in first) < MOST_OF_ONE_SECTION:
+            first.append(remark)
+    rest = [remark for remark in seen.values() if remark not in first]
+    while len(first) < SHOWN and rest:
+        first.append(rest.pop(0))
+
+    def listed(part: list[Remark]) -> list[dict[str, str]]:
+        return [
+            {"sentence": r.sentence, "section": r.section, "heading": words(f"sections.{r.section}")}
+            for r in part
+        ]
+
+    return {"items": listed(first), "more": listed(rest)}
 
 
 def _warnings(inputs: ReportInputs) -> list[Remark]:
-    remarks = []
     told = (inputs.log_facts.get("recovery") or {}).get(
         "sentence"
     )  # the list has it already, with the seconds
+    remarks = []
     for stage, manifest in inputs.manifests.items():
-        for sentence in manifest.get("warnings") or ():
-            if sentence == told:
-                continue
-            remarks.append(Remark(SERIOUS, str(sentence), SECTION_OF_STAGE.get(stage, "provenance")))
-    for facts, section in (
-        (inputs.solution, "quality"),
-        (inputs.survey, "stations"),
-        (inputs.log_facts, "coverage"),
-    ):
-        for sentence in facts.get("warnings") or ():
-            remarks.append(Remark(SERIOUS, str(sentence), section))
+        for sentence in map(str, manifest.get("warnings") or ()):
+            section = SECTION_OF_STAGE.get(stage, "provenance")
+            if sentence != told:
+                remarks.append(Remark(SERIOUS, sentence, _statics_or(section, sentence)))
+    for sentence in map(str, inputs.solution.get("warnings") or ()):
+        remarks.append(Remark(SERIOUS, sentence, _statics_or("quality", sentence)))
     return remarks
+
+
+def _statics_or(section: str, sentence: str) -> str:
+    return "statics" if section == "quality" and " moved " in sentence else section
 
 
 def _of_log(inputs: ReportInputs, words: Words) -> list[Remark]:
@@ -131,12 +142,29 @@ def _of_stations(inputs: ReportInputs, units: Units, words: Words) -> list[Remar
         remarks.append(Remark(SERIOUS, words("attention.cannot_tell", n=unsure), "stations"))
     gone = np.flatnonzero(verdict == "NOT REACHED")
     if len(gone):
-        first, last = (station_text(stations["station"][i], units) for i in (gone[0], gone[-1]))
-        sentence = words("attention.not_reached", n=len(gone), first=first, last=last)
+        sentence = words(
+            "attention.not_reached", n=len(gone), spans=_spans(stations["station"], gone, units, words)
+        )
         remarks.append(Remark(SERIOUS, sentence, "stations"))
     if partly := int((stations["state"] == "partly cut").sum()):
         remarks.append(Remark(WORTH, words("attention.partly", n=partly), "stations"))
     return remarks
+
+
+def _spans(station: np.ndarray, rows: np.ndarray, units: Units, words: Words) -> str:
+    """Runs of neighbouring stations in words, at most three."""
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    said = [
+        words(
+            "attention.span",
+            first=text_of(float(units.to_length(station[run[0]])), units.station_digits),
+            last=station_text(station[run[-1]], units),
+        )
+        if len(run) > 1
+        else station_text(station[run[0]], units)
+        for run in runs[:3]
+    ]
+    return ", ".join(said) + (", …" if len(runs) > 3 else "")
 
 
 def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number] | None) -> list[Remark]:
@@ -165,15 +193,16 @@ def _of_network(inputs: ReportInputs, words: Words) -> list[Remark]:
             remarks.append(Remark(SERIOUS, sentence, "quality"))
     statics = inputs.table("statics")
     if statics is not None:
+        told = " ".join(map(str, inputs.solution.get("warnings") or ()))
         shift = np.nan_to_num(statics["shift_sigmas"])
-        for i in np.argsort(-np.abs(shift), kind="stable"):
-            if abs(shift[i]) <= MOVED_SIGMAS:
-                break
+        moved = [i for i in np.argsort(-np.abs(shift), kind="stable") if abs(shift[i]) > MOVED_SIGMAS]
+        moved = [i for i in moved if str(statics["quantity"][i]) not in told]
+        if moved:
             sentence = words(
                 "attention.static_moved",
-                quantity=statics["quantity"][i],
-                component=statics["component"][i],
-                sigmas=text_of(float(shift[i]), 1, signed=True),
+                n=len(moved),
+                quantity=f"{statics['quantity'][moved[0]]} {statics['component'][moved[0]]}",
+                sigmas=text_of(float(shift[moved[0]]), 1, signed=True),
             )
             remarks.append(Remark(WORTH, sentence, "statics"))
     return remarks

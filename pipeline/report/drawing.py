@@ -11,6 +11,8 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from html import escape
+from itertools import pairwise
+from typing import Any
 
 import matplotlib
 import numpy as np
@@ -24,7 +26,7 @@ WIDTH_IN = 7.6
 """Of every figure. At this width 7.5 pt are 7 pt on A4 and 13 px on a screen."""
 MAX_POINTS = 1500
 
-_STYLE = {
+_STYLE: dict[Any, Any] = {
     "svg.hashsalt": "gradetrace",
     "svg.fonttype": "path",  # the same glyphs everywhere: labels that fit here fit on any machine
     "font.family": "DejaVu Sans",
@@ -72,7 +74,7 @@ DEVIATION_MAP = LinearSegmentedColormap.from_list("low_to_high", palette.LOW_TO_
 
 @contextmanager
 def house_style() -> Iterator[None]:
-    """matplotlib as this page wants it, whatever the user's own settings are."""
+    """The page's own style in matplotlib, whatever the user's own settings are."""
     with matplotlib.rc_context():
         matplotlib.rcdefaults()
         matplotlib.rcParams.update(_STYLE)
@@ -131,17 +133,20 @@ def decimated(x: np.ndarray, y: np.ndarray, limit: int = MAX_POINTS) -> tuple[np
     ----------
     x, y : (n,) arrays
         ``x`` ascending; NaN in ``y`` is a gap.
+    limit : int
+        Shorter lines stay as they are.
 
     Returns
     -------
-    two (m,) arrays, ``m <= max(limit, 3)`` or so
+    two (m,) arrays
+        With ``m`` at most about `limit`.
     """
     x, y = np.asarray(x, float), np.asarray(y, float)
     if len(x) <= limit:
         return x, y
     edges = np.linspace(0, len(x), limit // 3 + 1).astype(int)
     keep: list[int] = []
-    for start, end in zip(edges[:-1], edges[1:]):
+    for start, end in pairwise(edges):
         part = y[start:end]
         holes = np.flatnonzero(np.isnan(part))
         chosen = set(holes[:1].tolist())

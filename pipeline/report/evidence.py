@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -230,7 +231,7 @@ def quality(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     last = len(observed) - 1
     names = [
         f"{low:.2f} to {high:.2f}" if i < last else f"{low:.2f} and more"
-        for i, (low, high) in enumerate(zip(HISTOGRAM_EDGES[:-1], HISTOGRAM_EDGES[1:]))
+        for i, (low, high) in enumerate(pairwise(HISTOGRAM_EDGES))
     ]
     histogram = numbers.records({"bin": names, "observed": observed, "expected": expected})
     return {
@@ -256,7 +257,7 @@ def _labelled(figures: list[tuple[str, numbers.Number]], words: Words) -> list[d
 
 def error_budget(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any] | None:
     """Standard deviation of the cutting edge's elevation by source, the largest first, and their whole."""
-    parts = budget_parts(inputs)
+    parts = budget_parts(inputs, words)
     if not parts:
         return None
     total = sum(sigma**2 for _, sigma in parts)
@@ -276,10 +277,14 @@ def error_budget(inputs: ReportInputs, units: Units, words: Words) -> dict[str, 
     return numbers.table(columns, rows)
 
 
-def budget_parts(inputs: ReportInputs) -> list[tuple[str, float]]:
+def budget_parts(inputs: ReportInputs, words: Words) -> list[tuple[str, float]]:
     """Source and sigma in metres, the largest first."""
-    found = (inputs.solution.get("error_budget") or {}).get("sources_mm") or {}
-    parts = [(str(source), float(mm) / 1000) for source, mm in found.items() if mm is not None]
+    found = inputs.solution.get("error_budget") or {}
+    parts = [
+        (words(f"sources.{source}") if words.has(f"sources.{source}") else str(source), float(sigma))
+        for source, sigma in found.items()
+        if isinstance(sigma, (int, float))
+    ]
     return sorted(parts, key=lambda part: (-part[1], part[0]))
 
 
@@ -289,7 +294,7 @@ def statics(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     if found is None:
         return {"statics": None, "statics_rest": None}
     columns = [
-        column("quantity", words("columns.quantity"), kind="name"),
+        column("quantity", words("columns.quantity"), kind="id"),
         column("component", words("columns.component")),
         column("source", words("columns.source")),
         column("file_value", words("columns.file_value"), "", 6, signed=False),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, to_rgba
 from matplotlib.figure import Figure
-from matplotlib.patches import Patch, Polygon
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
 from pipeline.report import numbers, palette
@@ -52,7 +54,7 @@ def benchmarks_en(inputs: ReportInputs) -> dict[str, np.ndarray]:
 def points_table(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any]:
     """Benchmarks and check shots of the plan with their coordinates."""
     columns = [
-        column("point", words("columns.point"), kind="name"),
+        column("point", words("columns.point"), kind="id"),
         column("what", words("columns.what")),
         column("e", words("columns.e"), units.length, units.length_digits),
         column("n", words("columns.n"), units.length, units.length_digits),
@@ -74,77 +76,98 @@ def points_table(inputs: ReportInputs, units: Units, words: Words) -> dict[str, 
     return numbers.table(columns, rows)
 
 
+@dataclass(frozen=True)
+class Sheet:
+    """Where a grid coordinate lies on the plan: in the page's unit, from a round corner nearby.
+
+    Seven-digit northings would be cut into steps by the renderer's 32 bit floats.
+    """
+
+    corner: np.ndarray
+    """(2,) round easting and northing, length unit."""
+    per_metre: float
+
+    def place(self, en: np.ndarray) -> np.ndarray:
+        """(..., 2) grid metres -> (..., 2) on the sheet."""
+        return np.asarray(en, float) * self.per_metre - self.corner
+
+
 def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Figure:
     """North up and to scale: alignment, design outline, cells by deviation, check shots, benchmarks."""
     marks = benchmarks_en(inputs)
     checks = inputs.table("checks")
     outline, centre = _outline(grid, line), drawn_line(line)
-    corners = [centre, *outline, *(mark[None] for mark in marks.values())]
+    corners = [_near(centre, line, grid), *outline, *(mark[None] for mark in marks.values())]
     if checks is not None:
         corners.append(np.stack([checks["e"], checks["n"]], axis=1))
-    everything = np.concatenate(corners)
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    size = np.maximum(high - low, 1.0) * 1.12
-    figure = new_figure(float(np.clip(WIDTH_IN * 0.82 * size[1] / size[0] + 0.9, 2.6, 6.2)))
+    everything = np.concatenate(corners) * units.per_metre
+    sheet = Sheet(np.floor(everything.min(axis=0) / 10) * 10, units.per_metre)
+    low, high = everything.min(axis=0) - sheet.corner, everything.max(axis=0) - sheet.corner
+    size = np.maximum(high - low, 1.0) + 0.14 * float(np.max(high - low))
+    figure = new_figure(float(np.clip(WIDTH_IN * 0.78 * size[1] / size[0] + 0.75, 2.8, 5.4)))
     ax = figure.subplots()
-    # Plotted from a near corner: float32 in the renderer would cut seven-digit northings into steps.
-    origin = np.floor(low)
+    middle = (low + high) / 2
+    ax.set_xlim(middle[0] - size[0] / 2, middle[0] + size[0] / 2)
+    ax.set_ylim(middle[1] - size[1] / 2, middle[1] + size[1] / 2)
+    ax.set_aspect("equal", adjustable="box")
     reach = scale_of(inputs, grid)
     norm = Normalize(-float(units.to_deviation(reach)), float(units.to_deviation(reach)))
-    _cells(ax, grid, line, origin, norm, units)
-    for part in outline:
-        ax.add_patch(Polygon((part - origin) * units.per_metre, fill=False, ec=palette.DESIGN, lw=0.6))
-    at = (centre - origin) * units.per_metre
-    ax.plot(*at.T, color=palette.DESIGN, lw=0.7, ls=(0, (8, 2, 2, 2)))
-    _station_marks(ax, line, origin, grid, units)
+    _cells(ax, grid, line, sheet, norm, units)
+    for ring in outline:
+        ax.add_patch(Polygon(sheet.place(ring), fill=False, ec=palette.DESIGN, lw=0.6))
+    dashes = (0, (8, 2, 2, 2))
+    ax.plot(*sheet.place(centre).T, color=palette.DESIGN, lw=0.7, ls=dashes)
+    _station_marks(ax, line, sheet, grid, units)
     if checks is not None:
-        e, n = ((np.asarray(checks[k], float) - o) * units.per_metre for k, o in zip("en", origin))
-        ax.plot(e, n, "D", ms=3.4, mfc="white", mec=palette.CHECK, mew=0.9, ls="", label="check shot")
+        at = sheet.place(np.stack([checks["e"], checks["n"]], axis=1))
+        ax.plot(*at.T, "D", ms=3.4, mfc="white", mec=palette.CHECK, mew=0.9, ls="", label="check shot")
     for i, (name, en) in enumerate(marks.items()):
-        e, n = (en - origin) * units.per_metre
-        ax.plot(e, n, "^", ms=6, color=palette.INK, ls="", label="benchmark" if i == 0 else None)
-        ax.annotate(name, (e, n), (0, 5), textcoords="offset points", ha="center", fontsize=7)
-    middle = ((low + high) / 2 - origin) * units.per_metre
-    span = size * units.per_metre
-    ax.set_xlim(middle[0] - span[0] / 2, middle[0] + span[0] / 2)
-    ax.set_ylim(middle[1] - span[1] / 2, middle[1] + span[1] / 2)
-    ax.set_aspect("equal", adjustable="datalim")
-    for axis, start in ((ax.xaxis, origin[0]), (ax.yaxis, origin[1])):
-        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
-        axis.set_major_formatter(
-            FuncFormatter(lambda value, _, start=start: text_of(value + start * units.per_metre, 1))
-        )
+        at = sheet.place(en)
+        ax.plot(*at, "^", ms=6, color=palette.INK, ls="", label="benchmark" if i == 0 else None)
+        ax.annotate(name, tuple(at), (0, 5), textcoords="offset points", ha="center", fontsize=7)
+    for axis, start in ((ax.xaxis, sheet.corner[0]), (ax.yaxis, sheet.corner[1])):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=2))
+        axis.set_major_formatter(FuncFormatter(lambda value, _, start=start: _coordinate(value + start)))
     ax.set_xlabel(f"Easting [{units.length}]")
     ax.set_ylabel(f"Northing [{units.length}]")
     for spine in ax.spines.values():
         spine.set_visible(True)
-    handles = [
+    handles: list[Any] = [
         Patch(fc=palette.PAPER, ec=palette.DESIGN, lw=0.6, label="design"),
-        ax.plot([], [], color=palette.DESIGN, lw=0.7, ls=(0, (8, 2, 2, 2)), label="alignment")[0],
+        Line2D([], [], color=palette.DESIGN, lw=0.7, ls=dashes, label="alignment"),
     ]
     known, names = ax.get_legend_handles_labels()
     handles += [h for h, name in zip(known, names) if name in ("check shot", "benchmark")]
     figure.legend(handles=handles, loc="outside upper left", ncols=4, handlelength=2.2)
     _colour_bar(figure, ax, norm, inputs, units)
-    _north_and_scale(ax, units)
+    busy = [sheet.place(part) for part in corners]
+    _north_and_scale(ax, np.concatenate(busy), units)
     return figure
 
 
-def _cells(ax: Axes, grid: Grid, line: Alignment, origin: np.ndarray, norm: Normalize, units: Units) -> None:
+def _coordinate(value: float) -> str:
+    return text_of(value, 0 if abs(value - round(value)) < 1e-6 else 1)
+
+
+def _near(centre: np.ndarray, line: Alignment, grid: Grid) -> np.ndarray:
+    """The part of a long alignment that runs along the cells, or the plan would shrink the trench to a dot."""
+    part = np.linspace(grid.station[0], grid.station[-1], 50)
+    reach = 0.1 * (part[-1] - part[0])
+    part = np.clip([part[0] - reach, *part, part[-1] + reach], line.start_station, line.end_station)
+    return line.points(part, 0.0)
+
+
+def _cells(ax: Axes, grid: Grid, line: Alignment, sheet: Sheet, norm: Normalize, units: Units) -> None:
     take = slice(None, None, max(1, len(grid.station) // MAX_PLAN_COLUMNS))
     station, image = grid.station[take], grid.values["deviation"][:, take]
-    ds, do = _pitch(station), grid.cell_m[1]
+    ds = float(station[1] - station[0]) if len(station) > 1 else grid.cell_m[0]
+    do = grid.cell_m[1]
     edge_s = np.append(station - ds / 2, station[-1] + ds / 2)
     edge_o = np.append(grid.offset - do / 2, grid.offset[-1] + do / 2)
-    s, o = np.meshgrid(edge_s, edge_o)
-    corner = (line.points(s, o) - origin) * units.per_metre
+    corner = sheet.place(line.points(*np.meshgrid(edge_s, edge_o)))
     masked = np.ma.masked_invalid(units.to_deviation(image))
     # One raster image inside the SVG: as vector cells this figure alone would be six megabytes.
     ax.pcolormesh(corner[..., 0], corner[..., 1], masked, cmap=DEVIATION_MAP, norm=norm, rasterized=True)
-
-
-def _pitch(station: np.ndarray) -> float:
-    return float(station[1] - station[0]) if len(station) > 1 else 0.05
 
 
 def _outline(grid: Grid, line: Alignment) -> list[np.ndarray]:
@@ -178,21 +201,19 @@ def _corners(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     return np.flatnonzero(turns)
 
 
-def _station_marks(ax: Axes, line: Alignment, origin: np.ndarray, grid: Grid, units: Units) -> None:
+def _station_marks(ax: Axes, line: Alignment, sheet: Sheet, grid: Grid, units: Units) -> None:
     """Ticks across the alignment at round stations, with their value."""
     first, last = units.to_length([grid.station[0], grid.station[-1]])
     ticks = [t for t in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(first, last) if first <= t <= last]
-    reach = float(np.abs(grid.offset).max()) + grid.cell_m[1]
+    inside = np.isfinite(grid.values["design_h"]).any(axis=1)
+    reach = float(np.abs(grid.offset[inside] if inside.any() else grid.offset).max()) + grid.cell_m[1]
     for tick in ticks:
-        station = np.array(tick / units.per_metre)
-        ends = np.stack([line.points(station, np.array(o)) for o in (-reach, reach)])
-        ends = (ends - origin) * units.per_metre
+        ends = sheet.place(line.points(np.array(tick / units.per_metre), np.array([-reach, reach])))
         ax.plot(*ends.T, color=palette.MUTED, lw=0.6)
-        along = ends[1] - ends[0]
-        away = along / np.hypot(*along)
+        away = (ends[1] - ends[0]) / np.hypot(*(ends[1] - ends[0]))
         ax.annotate(
             text_of(tick, 0),
-            ends[1],
+            tuple(ends[1]),
             tuple(9 * away),
             textcoords="offset points",
             ha="center",
@@ -215,12 +236,19 @@ def _colour_bar(figure: Figure, ax: Axes, norm: Normalize, inputs: ReportInputs,
         bar.ax.axhline(float(units.to_deviation(limit / 1000)), color=palette.INK, lw=1.0)
 
 
-def _north_and_scale(ax: Axes, units: Units) -> None:
-    """North arrow and a scale bar of a round length, in the corners that are free."""
+def _north_and_scale(ax: Axes, busy: np.ndarray, units: Units) -> None:
+    """North arrow and a scale bar of a round length, in the two corners that are freest."""
+    left, right = ax.get_xlim()
+    bottom, top = ax.get_ylim()
+    width, height = right - left, top - bottom
+    at = (busy - [left, bottom]) / [width, height]
+    corners = [(0.86, 0.88), (0.14, 0.1), (0.86, 0.1), (0.14, 0.88)]
+    free = sorted(corners, key=lambda c: -float(np.min(np.hypot(*(at - c).T))))
+    (nx, ny), (bx, by) = free[0], free[1]
     ax.annotate(
         "N",
-        (0.965, 0.95),
-        (0.965, 0.80),
+        (nx, min(ny + 0.07, 0.96)),
+        (nx, min(ny + 0.07, 0.96) - 0.36 / (0.78 * WIDTH_IN * height / width)),
         xycoords="axes fraction",
         textcoords="axes fraction",
         ha="center",
@@ -229,31 +257,22 @@ def _north_and_scale(ax: Axes, units: Units) -> None:
         fontweight="bold",
         arrowprops={"arrowstyle": "-|>", "lw": 1.0, "fc": palette.INK, "ec": palette.INK},
     )
-    left, right = ax.get_xlim()
-    bottom, top = ax.get_ylim()
-    width, height = right - left, top - bottom
-    wish = 0.2 * width
+    wish = 0.16 * width
     power = 10.0 ** np.floor(np.log10(wish))
     length = max(step * power for step in (1, 2, 5) if step * power <= wish)
-    x, y = left + 0.03 * width, bottom + 0.05 * height
+    x, y = left + bx * width - length / 2, bottom + by * height
+    thick = 0.008 * max(width, height)
     for part, colour in ((0, palette.INK), (1, palette.PAPER)):
-        ax.barh(
-            y,
-            length / 2,
-            left=x + part * length / 2,
-            height=0.012 * height,
-            color=colour,
-            ec=palette.INK,
-            lw=0.6,
-            zorder=5,
+        bar = Rectangle(
+            (x + part * length / 2, y), length / 2, thick, fc=colour, ec=palette.INK, lw=0.6, zorder=5
         )
-    digits = 0 if length >= 1 else 1
+        ax.add_patch(bar)
     ax.annotate(
-        f"{text_of(length, digits)} {units.length}",
-        (x + length, y),
-        (4, 0),
+        f"{text_of(length, 0 if length >= 1 else 1)} {units.length}",
+        (x + length / 2, y + thick),
+        (0, 3),
         textcoords="offset points",
-        va="center",
+        ha="center",
         fontsize=7,
         zorder=5,
     )

@@ -20,12 +20,12 @@ INDICATIVE_BELOW = 30
 """Fewer check shots than this carry no accuracy statement, only an indication."""
 
 
-def stations_table(stations: Table, units: Units, words: Words) -> dict[str, Any]:
-    """The station table of the page."""
+def stations_table(stations: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:
+    """The station table of the page; `whole` for the export: with the reason of every station."""
     length, fall = units.length, units.deviation
     columns = [
         column("station", words("columns.station"), length, units.station_digits),
-        column("verdict", words("columns.verdict"), kind="verdict"),
+        column("verdict", words("columns.verdict"), kind="judged"),
         column("deviation", words("columns.deviation"), fall, units.deviation_digits, signed=True),
         column("u", words("columns.u"), fall, units.deviation_digits),
         column("h", words("columns.h"), length, units.length_digits),
@@ -35,9 +35,11 @@ def stations_table(stations: Table, units: Units, words: Words) -> dict[str, Any
         column("width", words("columns.width"), length, units.station_digits),
         column("covered", words("columns.covered"), "%", 0),
         column("state", words("columns.state")),
-        column("reason", words("columns.reason")),
+        column("reason", words("columns.reason"), kind="why"),
     ]
     floor = np.asarray(stations["cells_floor"], float)
+    # Two hundred times "lies inside the tolerance" would hide the reasons that matter.
+    plain_pass = ~np.full(len(floor), whole) & (stations["verdict"] == "PASS") & (stations["state"] == "cut")
     rows = numbers.records(
         {
             "station": units.to_length(stations["station"]),
@@ -51,18 +53,18 @@ def stations_table(stations: Table, units: Units, words: Words) -> dict[str, Any
             "width": units.to_length(stations["width"]),
             "covered": 100.0 * np.asarray(stations["cells_cut"], float) / np.where(floor > 0, floor, np.nan),
             "state": stations["state"],
-            "reason": stations["reason"],
+            "reason": np.where(plain_pass, "", stations["reason"]),
         }
     )
     return numbers.table(columns, rows)
 
 
-def checks_table(checks: Table, units: Units, words: Words) -> dict[str, Any]:
-    """The check-shot table of the page."""
+def checks_table(checks: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:
+    """The check-shot table of the page; `whole` for the export: with coordinates, for which paper has no room."""
     length, fall, fine = units.length, units.deviation, units.fine_digits
     columns = [
-        column("point", words("columns.point"), kind="name"),
-        column("code", words("columns.code"), kind="name"),
+        column("point", words("columns.point"), kind="id"),
+        column("code", words("columns.code"), kind="id"),
         column("station", words("columns.station"), length, units.station_digits),
         column("offset", words("columns.offset"), length, units.station_digits, signed=True),
         column("h", words("columns.shot_h"), length, units.length_digits),
@@ -72,9 +74,9 @@ def checks_table(checks: Table, units: Units, words: Words) -> dict[str, Any]:
         column("sigma_ts", words("columns.sigma_ts"), fall, fine),
         column("z", words("columns.z"), "", 1, signed=True),
         column("result", words("columns.result")),
-        column("e", words("columns.e"), length, units.length_digits),
-        column("n", words("columns.n"), length, units.length_digits),
     ]
+    if whole:
+        columns += [column(key, words(f"columns.{key}"), length, units.length_digits) for key in ("e", "n")]
     shown = {key: checks[key] for key in ("point", "code", "z", "result")}
     shown |= {key: units.to_length(checks[key]) for key in ("station", "offset", "h", "as_built_h", "e", "n")}
     shown |= {key: units.to_deviation(checks[key]) for key in ("difference", "sigma", "sigma_ts")}
@@ -139,7 +141,7 @@ def _step(centres: np.ndarray) -> float:
 
 @dataclass(frozen=True)
 class Section:
-    """One cross section: the cells of one station, mean over the cells of the station's length."""
+    """One cross section: the cells that touch one station."""
 
     station: float
     why: str
@@ -153,38 +155,37 @@ class Section:
 def sections_of(inputs: ReportInputs, grid: Grid) -> list[Section]:
     """Regular cross sections, at most nine, and those of the three worst stations, by station."""
     stations = inputs.table("stations")
-    columns: dict[int, str] = {}
-    cut = np.flatnonzero(np.isfinite(grid.values["h"]).any(axis=0))
+    cut = grid.station[np.isfinite(grid.values["h"]).any(axis=0)]
     if len(cut) == 0:
         return []
     step = inputs.site.report.cross_section_step_m
-    first, last = grid.station[cut[0]], grid.station[cut[-1]]
-    wanted = np.arange(np.ceil(first / step) * step, last + 1e-9, step)
-    if len(wanted) == 0:
-        wanted = np.array([(first + last) / 2])
-    if len(wanted) > MAX_REGULAR_SECTIONS:
-        wanted = wanted[np.linspace(0, len(wanted) - 1, MAX_REGULAR_SECTIONS).round().astype(int)]
-    for station in wanted:
-        columns.setdefault(int(cut[np.argmin(np.abs(grid.station[cut] - station))]), "regular")
+    regular = np.arange(np.ceil(cut[0] / step) * step, cut[-1] + 1e-9, step)
+    if len(regular) == 0:
+        regular = np.array([(cut[0] + cut[-1]) / 2])
+    if len(regular) > MAX_REGULAR_SECTIONS:
+        regular = regular[np.linspace(0, len(regular) - 1, MAX_REGULAR_SECTIONS).round().astype(int)]
+    wanted = {round(float(station), 6): "regular" for station in regular}
     if stations is not None:
         dug = np.flatnonzero(np.isfinite(stations["deviation"]))
         worst = dug[np.argsort(-np.abs(stations["deviation"][dug]), kind="stable")][:WORST_SECTIONS]
-        for station in stations["station"][worst]:
-            columns[int(cut[np.argmin(np.abs(grid.station[cut] - station))])] = "worst"
-    sections = []
-    for at, why in sorted(columns.items()):
-        values = {name: grid.values[name][:, at] for name in ("h", "design_h", "sigma_own", "sigma_common")}
-        sections.append(
-            Section(
-                float(grid.station[at]),
-                why,
-                grid.offset,
-                values["h"],
-                values["design_h"],
-                np.hypot(values["sigma_own"], values["sigma_common"]),
-            )
+        wanted |= {round(float(station), 6): "worst" for station in stations["station"][worst]}
+    sections = [_section(grid, station, why) for station, why in sorted(wanted.items())]
+    return [section for section in sections if np.isfinite(section.h).any()]
+
+
+def _section(grid: Grid, station: float, why: str) -> Section:
+    """The mean of the cells that touch a station, which lies as often on their border as inside one."""
+    near = np.abs(grid.station - station) <= grid.cell_m[0] * (0.5 + 1e-6)
+    means = {}
+    for name in ("h", "design_h", "sigma_own", "sigma_common"):
+        part = grid.values[name][:, near]
+        known = np.isfinite(part)
+        count = known.sum(axis=1)
+        means[name] = np.where(
+            count > 0, np.where(known, part, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan
         )
-    return sections
+    sigma = np.hypot(means["sigma_own"], means["sigma_common"])
+    return Section(station, why, grid.offset, means["h"], means["design_h"], sigma)
 
 
 def sections_table(sections: list[Section], units: Units, words: Words) -> dict[str, Any]:

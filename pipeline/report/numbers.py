@@ -40,7 +40,7 @@ def plain(value: Any, digits: int) -> float | int | None:
 def column(
     key: str, label: str, unit: str = "", digits: int | None = None, signed: bool = False, kind: str = ""
 ) -> dict[str, Any]:
-    """One column of a table. `digits` None means text; `kind` may be verdict or code."""
+    """One column of a table. `digits` None means text; `kind` names its class: judged, code, id or why."""
     return {"key": key, "label": label, "unit": unit, "digits": digits, "signed": signed, "kind": kind}
 
 

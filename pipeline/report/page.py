@@ -6,12 +6,14 @@ report.json says cannot part.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import jinja2
 import numpy as np
 from markupsafe import Markup, escape
+from matplotlib.figure import Figure
 
 from pipeline.report import charts, evidence, facts, maps, measured, numbers, palette, profiles
 from pipeline.report.attention import attention
@@ -33,6 +35,8 @@ class Page:
     html: str
     content: dict[str, Any]
     """report.json."""
+    exports: dict[str, dict[str, Any]]
+    """Whole tables for CSV files: ``stations``, ``checks``; only those that there are."""
 
 
 def render(inputs: ReportInputs, language: str = "en") -> Page:
@@ -51,7 +55,7 @@ def render(inputs: ReportInputs, language: str = "en") -> Page:
     style = Markup((template_folder() / "style.css").read_text(encoding="utf-8"))
     svg = {name: Markup(text) for name, text in pictures.items()}
     html = environment.get_template("report.html").render(page=content, svg=svg, w=words, style=style)
-    return Page(html, content)
+    return Page(html, content, _exports(inputs, units, words))
 
 
 def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str, Any], dict[str, str]]:
@@ -94,6 +98,15 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
     return content, pictures
 
 
+def _exports(inputs: ReportInputs, units: Units, words: Words) -> dict[str, dict[str, Any]]:
+    found = {}
+    if (stations := inputs.table("stations")) is not None:
+        found["stations"] = measured.stations_table(stations, units, words, whole=True)
+    if (checks := inputs.table("checks")) is not None:
+        found["checks"] = measured.checks_table(checks, units, words, whole=True)
+    return found
+
+
 def _labelled_statistics(statistics, words: Words) -> list[dict[str, Any]] | None:
     if statistics is None:
         return None
@@ -113,7 +126,7 @@ def _figures(
     about: dict[str, dict[str, str]] = {}
     stations, checks = inputs.table("stations"), inputs.table("checks")
 
-    def add(name: str, missing: str, draw, **places: Any) -> None:
+    def add(name: str, missing: str, draw: Callable[[], Figure] | None, **places: Any) -> None:
         key = f"figures.{name}"
         about[name] = {
             "title": words(f"{key}.title"),
@@ -180,13 +193,11 @@ def _figures(
         else:
             add("deviation_map", "as_built", None)
         compared = 0 if checks is None else int(np.isfinite(checks["difference"]).sum())
-        add(
-            "checks",
-            "checks",
-            (lambda: profiles.check_shots(checks, units)) if compared else None,
-            n=compared,
-        )
-        parts = evidence.budget_parts(inputs)
+        if checks is not None and compared:
+            add("checks", "", lambda: profiles.check_shots(checks, units), n=compared)
+        else:
+            add("checks", "checks", None)
+        parts = evidence.budget_parts(inputs, words)
         text = ", ".join(
             f"{name} {facts.deviation_number(v, units, False, True)['value']}" for name, v in parts
         )
@@ -232,7 +243,7 @@ def _num(value: numbers.Number, key: str) -> Markup:
 
 def _cell(value: Any, column: dict[str, Any]) -> Markup:
     """The content of a table's cell."""
-    if column["kind"] == "verdict":
+    if column["kind"] == "judged":
         return _verdict(value)
     if column["digits"] is None:
         return escape(value)

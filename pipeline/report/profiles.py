@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -105,7 +107,7 @@ def _deviations(
     alone &= ~np.isfinite(np.r_[deviation[1:], np.nan])
     ax.plot(x[alone], units.to_deviation(deviation[alone]), "o", ms=2.5, color=palette.AS_BUILT)
     digits = units.deviation_digits
-    for value, va in ((high, "bottom"), (-low, "top")):
+    for value in (high, -low):
         ax.annotate(
             text_of(value, digits, signed=True),
             (1.0, value),
@@ -123,7 +125,7 @@ def _deviations(
     reach = max(float(units.to_deviation(reach)), 1.15 * high, 1.15 * low)
     ax.set_ylim(-1.08 * reach, 1.08 * reach)
     ax.set_ylabel(f"Deviation [{units.deviation}]")
-    ax.set_title("Deviation: + high (under-dug), − low (over-dug)")
+    ax.set_title("Deviation (+ high, − low)")
 
 
 def _centre_line(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
@@ -136,7 +138,14 @@ def _shots(above: Axes, below: Axes, checks: Table, stations: Table, units: Unit
     on = np.isfinite(checks["station"])
     station, h = np.asarray(checks["station"], float)[on], np.asarray(checks["h"], float)[on]
     sigma = np.asarray(checks["sigma_ts"], float)[on]
-    marks = {"fmt": "D", "ms": 3.2, "mfc": "white", "mec": palette.CHECK, "ecolor": palette.CHECK, "mew": 0.9}
+    marks: dict[str, Any] = {
+        "fmt": "D",
+        "ms": 3.2,
+        "mfc": "white",
+        "mec": palette.CHECK,
+        "ecolor": palette.CHECK,
+        "mew": 0.9,
+    }
     above.errorbar(
         units.to_length(station),
         units.to_length(h),

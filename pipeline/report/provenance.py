@@ -22,12 +22,16 @@ def method(inputs: ReportInputs, units: Units, words: Words) -> list[str]:
         deviation_text(tolerance.low_mm / 1000, units, False),
         deviation_text(tolerance.high_mm / 1000, units, False),
     )
+    # What this run did, in the words of the stage that did it; else what the settings say.
+    rules = inputs.survey.get("rules") or {}
+    surface = rules.get("surface") or words(f"method.{site.survey.surface}", cell=cell)
     return [
         words("method.sign"),
         words("method.rule", low=low, high=high),
         words("method.sigma", k=k),
-        words(f"method.{site.survey.surface}", cell=cell),
-        words("method.cells"),
+        surface,
+        *([rules["floor"]] if rules.get("floor") else []),
+        words("method.cells", cell=cell),
         words("method.network"),
         words("method.check"),
         words("method.units", units=units.describe()),
@@ -44,7 +48,7 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     files += [(kind, source) for kind, source in inputs.named_files.items()]
     file_columns = [
         column("what", words("columns.what")),
-        column("name", words("columns.name"), kind="name"),
+        column("name", words("columns.name"), kind="id"),
         column("origin", words("columns.origin")),
         column("sha256", words("columns.sha256"), kind="code"),
     ]

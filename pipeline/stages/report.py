@@ -49,11 +49,11 @@ def run(job: Job, progress: Progress) -> Counts:
     html = page.html.encode("utf-8")
     job.write_bytes("report.html", html)
     job.write_json("report.json", page.content)
-    for name in ("stations", "checks"):
-        if page.content[name] is not None:
-            job.write_bytes(f"{name}.csv", csv_of(page.content[name]))
+    for name, table in page.exports.items():
+        job.write_bytes(f"{name}.csv", csv_of(table))
     progress.advance()
     return {
+        "verdict": page.content["verdict"]["word"],
         "figures": sum(not figure["why"] for figure in page.content["figures"].values()),
         "remarks": len(page.content["attention"]["items"]) + len(page.content["attention"]["more"]),
         "kB": round(len(html) / 1000),
