@@ -82,7 +82,7 @@ def report(
     """Run what is stale and write the report of LOG.
 
     A second run does no work; a change to a setting redoes only the stages that use it; a run that was
-    killed goes on where it was.
+    killed goes on where it was. With --strict a verdict of FAIL counts for more than a loss.
     """
     from pipeline.progress import watch_on
     from pipeline.stages.job import open_job
@@ -92,10 +92,18 @@ def report(
         log, machine, site, runs, workers=jobs or usable_cores(), strict=strict, create_folder=True
     )
     _say_sources(job)
+    page = job.folder.file("report.html")
     with job.folder.locked():
-        run_stale(job, watch_on())
+        try:
+            run_stale(job, watch_on())
+        except PipelineError as error:
+            if page.exists():
+                raise type(error)(
+                    f"{error}\n{page} is of an earlier run and does not show this one"
+                ) from error
+            raise
         verdict, complete = _outcome(job)
-    click.echo(f"report: {job.folder.file('report.html')} · verdict {verdict}")
+    click.echo(f"report: {page} · verdict {verdict}")
     if strict and verdict == "FAIL":
         sys.exit(EXIT_VERDICT_FAIL)
     if strict and not complete:

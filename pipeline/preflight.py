@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.config import Machine, Site
-from pipeline.errors import DetectionError, LogError, PipelineError
+from pipeline.errors import DetectionError, LogError, PipelineError, UsageError
 from pipeline.runs import RunFolder
 from pipeline.stages.job import Source, check_log_file, describe, named_files
 
@@ -55,11 +55,16 @@ class Seen:
 
 
 def examine(log: Path, machine: Path | None = None, site: Path | None = None) -> list[Finding]:
-    """Everything found, in the order in which a run would stumble over it; a fault of the input is a finding."""
+    """Everything found, in the order in which a run would stumble over it; a fault of the input is a finding.
+
+    Raises UsageError when an option names no file.
+    """
     findings: list[Finding] = []
     try:
         for finding in _look(log, machine, site):
             findings.append(finding)
+    except UsageError:
+        raise
     except PipelineError as error:
         findings += [Finding("error", line) for line in str(error).splitlines()]
     return findings

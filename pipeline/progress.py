@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, TextIO
 
+from pipeline.runs import NEVER_RUN
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -39,8 +41,8 @@ class PlainWatch:
         self._stream = stream
 
     @contextmanager
-    def stage(self, stage: Stage) -> Iterator[Progress]:
-        self._line(f"{stage.name}: {stage.doing}")
+    def stage(self, stage: Stage, why: str) -> Iterator[Progress]:
+        self._line(start_line(stage, why))
         yield PlainProgress(stage.name, self._line)
 
     def done(self, stage: Stage, manifest: Manifest, ran: bool) -> None:
@@ -90,7 +92,7 @@ class TerminalWatch:
         self._console = console
 
     @contextmanager
-    def stage(self, stage: Stage) -> Iterator[Progress]:
+    def stage(self, stage: Stage, why: str) -> Iterator[Progress]:
         from rich.progress import (
             BarColumn,
             MofNCompleteColumn,
@@ -116,7 +118,7 @@ class TerminalWatch:
             speed_estimate_period=60,
         )
         with bar:
-            task = bar.add_task(f"{stage.name}: {stage.doing}", total=None, unit="")
+            task = bar.add_task(start_line(stage, why), total=None, unit="")
             yield TerminalProgress(stage.name, bar, task)
 
     def done(self, stage: Stage, manifest: Manifest, ran: bool) -> None:
@@ -154,6 +156,11 @@ class Silence:
 
     def warn(self, sentence: str) -> None:
         self.warnings.append(sentence)
+
+
+def start_line(stage: Stage, why: str) -> str:
+    """What is said when a stage starts: what it does, and why again where it was done before."""
+    return f"{stage.name}: {stage.doing}" + ("" if why == NEVER_RUN else f" ({why})")
 
 
 def end_line(stage: Stage, manifest: Manifest, ran: bool) -> str:

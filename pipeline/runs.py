@@ -26,6 +26,8 @@ PARTIAL = ".partial"
 """Ending of a file that is being written; what a kill left of them is removed at the next start."""
 ALWAYS_HASHED_BYTES = 32_000_000
 """Files up to this size are hashed each time they are asked for: 20 ms, less than trusting a date is worth."""
+NEVER_RUN = "never run"
+"""Why a stage without a manifest is stale."""
 
 _NO_SPACE = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
@@ -240,7 +242,7 @@ class RunFolder:
         """Why a stage must run, as a few words, or None where its outputs stand for these inputs and settings."""
         manifest = self.manifest(stage)
         if manifest is None:
-            return "never run"
+            return NEVER_RUN
         if manifest.version != version:
             return "made by another version of the stage"
         if manifest.schemas != schemas:

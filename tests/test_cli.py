@@ -1,5 +1,6 @@
 """What a person types and reads: lines, exit codes, and what is done again after which change."""
 
+import io
 import json
 import re
 import shutil
@@ -8,6 +9,7 @@ import sys
 import time
 
 import pytest
+from rich.console import Console
 
 from pipeline import progress
 from pipeline.runs import Manifest
@@ -108,6 +110,7 @@ def test_a_report_setting_makes_a_new_page_and_nothing_else(copied, gradetrace):
     change(log.parent / "site.toml", 'title = "', 'title = "Another ')
     done = gradetrace("report", log, "--runs", runs)
     assert (done.code, ran(done)) == (0, ["report"])
+    assert "report: writing the report (site.report.title changed)" in done.out
     assert "Another " in (runs / "short" / "report.html").read_text()
 
 
@@ -182,8 +185,9 @@ def test_wrong_usage_ends_with_2(gradetrace, arguments):
     assert "Traceback" not in done.err
 
 
-def test_option_that_names_no_file_ends_with_2(recorded, gradetrace, tmp_path):
-    done = gradetrace("report", recorded / "short.mcap", "--site", tmp_path / "none.toml")
+@pytest.mark.parametrize("command", ["report", "status", "check"])
+def test_option_that_names_no_file_ends_with_2(recorded, gradetrace, tmp_path, command):
+    done = gradetrace(command, recorded / "short.mcap", "--site", tmp_path / "none.toml")
     assert done.code == 2
     assert re.fullmatch(r"gradetrace: --site .*none\.toml: no such file\n", done.err)
 
@@ -214,6 +218,30 @@ with mock.patch("pipeline.stages.job.open_job", side_effect=ZeroDivisionError):
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.returncode == 1
     assert "Traceback" in done.stderr
+
+
+def test_refusal_says_that_the_page_in_the_folder_is_of_an_earlier_run(copied, gradetrace):
+    log, runs = copied
+    (log.parent / "checks.csv").write_text("no,shots,here\n")
+    done = gradetrace("report", log, "--runs", runs)
+    assert done.code == 3
+    first, second = done.err.splitlines()
+    assert "checks.csv" in first
+    assert second == f"gradetrace: {runs}/short/report.html is of an earlier run and does not show this one"
+
+
+def test_bar_on_a_terminal_ends_as_the_line_of_its_stage():
+    console = Console(file=io.StringIO(), force_terminal=True, width=150, markup=False, highlight=False)
+    watch, stage = progress.TerminalWatch(console), stage_named("detect")
+    with watch.stage(stage, "log changed") as bar:
+        bar.total(10, "frames")
+        bar.advance(4)
+        bar.warn("camera 'arm': 1 of 10 frames is corrupt")
+    watch.done(stage, Manifest("detect", 1, "", {}, {}, {}, {}, {"frames": 10}, [], 1.25), ran=True)
+    text = console.file.getvalue()
+    assert "detect: finding markers (log changed)" in text
+    assert "detect: warning: camera 'arm': 1 of 10 frames is corrupt" in text
+    assert text.endswith("detect: 10 frames, 1.2 s\n")
 
 
 def test_counts_read_as_words():

@@ -19,8 +19,8 @@ from pipeline.stages.job import Job, Progress
 class Watch(Protocol):
     """Who watches a run."""
 
-    def stage(self, stage: Stage) -> AbstractContextManager[Progress]:
-        """Entered while a stage runs."""
+    def stage(self, stage: Stage, why: str) -> AbstractContextManager[Progress]:
+        """Entered while a stage runs; `why` it is stale."""
 
     def done(self, stage: Stage, manifest: Manifest, ran: bool) -> None:
         """Called after a stage ran, or was found up to date."""
@@ -90,7 +90,7 @@ def run_stale(job: Job, watch: Watch) -> list[str]:
         now = plan(job, stage)
         why = job.folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
         if why is not None:
-            run_stage(job, stage, now, watch)
+            run_stage(job, stage, now, watch, why)
             ran.append(stage.name)
         manifest = job.folder.manifest(stage.name)
         if manifest is None:
@@ -101,7 +101,7 @@ def run_stale(job: Job, watch: Watch) -> list[str]:
     return ran
 
 
-def run_stage(job: Job, stage: Stage, now: Plan, watch: Watch) -> None:
+def run_stage(job: Job, stage: Stage, now: Plan, watch: Watch, why: str) -> None:
     """Run one stage and write its manifest last."""
     before = job.folder.manifest(stage.name)
     # From here until the new manifest the old outputs are being replaced one by one.
@@ -109,7 +109,7 @@ def run_stage(job: Job, stage: Stage, now: Plan, watch: Watch) -> None:
     run = importlib.import_module(f"pipeline.stages.{stage.name}").run
     here = job.at(stage, now.fingerprint(stage))
     started = time.monotonic()
-    with watch.stage(stage) as progress:
+    with watch.stage(stage, why) as progress:
         kept = _Warnings(progress)
         counts = run(here, kept)
     outputs = {file: job.folder.hash_file(job.folder.file(file)) for file in sorted(here.written)}
