@@ -252,6 +252,16 @@ def _single_threaded_children() -> Iterator[None]:
                 os.environ[name] = value
 
 
+@contextlib.contextmanager
+def _interrupts_held() -> Iterator[None]:
+    # A child is born with this mask: Ctrl-C cannot print its traceback before `_start_worker` runs in it.
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
 def _search_in_processes(
     search: Search, slices: Sequence[Slice], workers: int, report: Callable[[Slice], None]
 ) -> list[Slice]:
@@ -271,7 +281,8 @@ def _search_in_processes(
             while True:
                 # Few are handed over at a time: what is queued is pickled and cannot be called back.
                 while len(futures) < 2 * workers and (part := next(ahead, None)) is not None:
-                    futures[pool.submit(_work, part)] = part
+                    with _interrupts_held():
+                        futures[pool.submit(_work, part)] = part
                 if not futures:
                     return list(undone.values())
                 for future in wait(futures, return_when=FIRST_COMPLETED).done:
