@@ -89,3 +89,21 @@ def test_two_runs_at_once_on_one_folder_do_not_mix(recorded, tmp_path, gradetrac
     assert second.code == 3
     assert second.err.startswith(f"gradetrace: {run} is in use by another gradetrace (process {first.pid})")
     kill_when(first, lambda: True)
+
+
+def test_ctrl_c_during_detection_is_one_line_and_130(recorded, tmp_path):
+    command = [sys.executable, "-m", "pipeline", "report", str(recorded / "short.mcap")]
+    process = subprocess.Popen(
+        [*command, "--runs", str(tmp_path / "runs"), "--jobs", "2"],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    while not list(tmp_path.glob("runs/short/.detect-*")):
+        assert process.poll() is None
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert said == "gradetrace: interrupted; the same command goes on where this one stopped\n"
