@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
 
 from pipeline import tables
+from pipeline.config.quantities import FAMILIES
 from pipeline.detection.acceptance import ACCEPTED, UNKNOWN_ID, KnownTags
+from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.decode import decode_grey
 from pipeline.detection.slices import (
     CORRUPT,
     SEARCHED,
     Search,
     Slice,
+    frames_of,
     read_piece,
     search_slices,
     slices_of,
@@ -26,6 +31,10 @@ from pipeline.stages.runner import Progress
 NEARLY_ALL = 0.9
 """Part of a camera's frames that must be corrupt before the job is given up."""
 PORTION_ROWS = 65_536
+LOOKS = 12
+"""Frames in which other families are looked for, when nothing at all was seen."""
+CERTAIN_MARGIN = 50.0
+"""Decision margin that patterns of soil do not reach."""
 
 
 def run(job: Job, progress: Progress) -> Counts:
@@ -53,7 +62,9 @@ def run(job: Job, progress: Progress) -> Counts:
         status.update(tags)
         seen.update(ids)
         accepted[camera] = tags[ACCEPTED]
-    _refuse_without_markers(job, frames, status, seen, known)
+    if not status[ACCEPTED]:
+        others = _other_families(search, slices) if not status else Counter()
+        _refuse_without_markers(job, frames, status, seen + others, known)
     for camera, count in accepted.items():
         if not count:
             progress.warn(f"camera '{camera}': not one marker was accepted in its frames")
@@ -116,6 +127,22 @@ def _judge_pictures(camera: str, frames: Counter[str], progress: Progress) -> No
         progress.warn(f"camera '{camera}': {count} of {total} frames {what} and were skipped")
 
 
+def _other_families(search: Search, slices: Sequence[Slice]) -> Counter[tuple[str, int]]:
+    """Tags of families that nobody described, in a few frames: what a wrong family in the files looks like."""
+    found: Counter[tuple[str, int]] = Counter()
+    finder = TagFinder(set(FAMILIES) - set(search.families), search.settings)
+    with read_log(search.log, search.contents) as reader:
+        for part in slices[:: max(1, len(slices) // LOOKS)]:
+            _, frame = next(frames_of(part, reader), (0, None))
+            if frame is None:
+                continue
+            with contextlib.suppress(DetectionError):
+                tags = finder.find(decode_grey(frame.data, frame.encoding, frame.width, frame.height))
+                sure = (tags.hamming == 0) & (tags.margin >= CERTAIN_MARGIN)
+                found.update(zip(tags.family[sure].tolist(), tags.tag_id[sure].tolist()))
+    return found
+
+
 def _refuse_without_markers(
     job: Job,
     frames: Counter[str],
@@ -123,8 +150,6 @@ def _refuse_without_markers(
     seen: Counter[tuple[str, int]],
     known: KnownTags,
 ) -> None:
-    if status[ACCEPTED]:
-        return
     expected = "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in known.items())
     where = f"{job.log.name}: in {frames[SEARCHED]} frames"
     if seen:

@@ -10,7 +10,7 @@ from pipeline.errors import ConfigError, DetectionError, LogError
 from pipeline.logs.writer import LogWriter
 from pipeline.stages import detect, ingest, stage_named
 
-from .conftest import HEIGHT, MACHINE, START, STEP, WIDTH, Watch, open_job, write_log
+from .conftest import HEIGHT, MACHINE, SITE, START, STEP, WIDTH, Watch, open_job, write_log
 
 
 def ingested(job):
@@ -103,6 +103,21 @@ def test_unknown_ids_only_names_what_was_seen_and_what_is_described(shift, tmp_p
         DetectionError, match=r"tag36h11 id 9; described are tag25h9 id 2; tag36h11 id 1; correct the ids"
     ):
         both(tmp_path, log)
+
+
+def test_a_wrong_family_is_found_out(shift, tmp_path):
+    """Nothing described is in view; the tags that are belong to families nobody named."""
+    machine = MACHINE.replace('family = "tag36h11"', 'family = "tagStandard41h12"')
+    site = SITE.replace('family = "tag25h9"', 'family = "tagStandard41h12"')
+    job = open_job(shift.parent, shift, runs=str(tmp_path), machine=machine, site=site)
+    try:
+        ingested(job)
+        with pytest.raises(
+            DetectionError, match=r"tag25h9 id 2; tag36h11 ids 1, 9; described are tagStandard41h12 ids 1, 2"
+        ):
+            detected(job)
+    finally:
+        open_job(shift.parent, shift, runs=str(tmp_path))
 
 
 def test_stamps_that_run_backwards_are_sorted_counted_and_told(shift, tmp_path):
