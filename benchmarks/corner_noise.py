@@ -20,8 +20,8 @@ from pipeline.detection.apriltag import TagFinder
 SIDES_PX = (16, 20, 25, 30, 40, 60, 80, 120, 160)
 TILTS_DEG = (0, 45, 60)
 BARS = (0.80, 1.25)
-ENOUGH = 10
-"""Tags found in a cell below which its figures say nothing; 16 px at 60 degrees is beyond the detector's reach."""
+ENOUGH = 0.75
+"""Part of the tags of a cell that must be found for it to be judged: of fewer, only the lucky ones are seen."""
 IDS = {"tag36h11": 587, "tag25h9": 35, "tag16h5": 30, "tagStandard41h12": 2115}
 
 
@@ -107,12 +107,12 @@ def main() -> int:
         for tilt_deg in TILTS_DEG:
             cell = measure(options.family, side_px, tilt_deg, options.trials, options.seed)
             cells.append(cell)
-            few = "" if cell.found >= ENOUGH else "   (too few)"
+            few = "" if cell.found >= ENOUGH * cell.trials else "   (too few)"
             print(
                 f"{side_px:4d}  {tilt_deg:4d}  {cell.found / cell.trials:5.2f}  {cell.rms_px:5.3f}   "
                 f"{cell.outward_px:+6.3f}   {cell.sigma_px:5.3f}   {cell.normalised:5.2f}{few}"
             )
-    judged = [cell for cell in cells if cell.found >= ENOUGH]
+    judged = [cell for cell in cells if cell.found >= ENOUGH * cell.trials]
     low, high = min(cell.normalised for cell in judged), max(cell.normalised for cell in judged)
     facing = {cell.side_px: cell for cell in judged if cell.tilt_deg == 0}
     line = (
