@@ -74,11 +74,17 @@ def attention(
 
     def listed(part: list[Remark]) -> list[dict[str, str]]:
         return [
-            {"sentence": r.sentence, "section": r.section, "heading": words(f"sections.{r.section}")}
+            {"sentence": _tidy(r.sentence), "section": r.section, "heading": words(f"sections.{r.section}")}
             for r in part
         ]
 
     return {"items": listed(first), "more": listed(rest)}
+
+
+def _tidy(sentence: str) -> str:
+    """A warning of a stage as a sentence of the page."""
+    sentence = sentence.strip()
+    return sentence[:1].upper() + sentence[1:] + ("" if sentence.endswith((".", "!", "?")) else ".")
 
 
 def _warnings(inputs: ReportInputs) -> list[Remark]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.config import Machine, Site
 from pipeline.surface.alignment import Alignment
+from pipeline.surface.design import Design
 
 Table = Mapping[str, np.ndarray]
 
@@ -37,6 +38,8 @@ class ReportInputs:
     """Files that site.toml names: ``design``, ``checks``."""
     alignment: Alignment | None = None
     """The line that stations run along, grid metres."""
+    design: Design | None = None
+    """The design, to draw it beside what was dug."""
     tables: Mapping[str, Table] = field(default_factory=dict)
     """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, checks."""
     detections: Mapping[str, Table] = field(default_factory=dict)

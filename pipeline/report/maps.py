@@ -36,7 +36,7 @@ def drawn_line(line: Alignment) -> np.ndarray:
 def scale_of(inputs: ReportInputs, grid: Grid) -> float:
     """Largest deviation of the colour scale in metres: twice the wider tolerance, more where cells need it."""
     tolerance = 2 * max(inputs.site.tolerance.high_mm, inputs.site.tolerance.low_mm, 1.0) / 1000
-    known = np.abs(grid.values["deviation"][np.isfinite(grid.values["deviation"])])
+    known = np.abs(grid.values["deviation"][np.isfinite(grid.values["deviation"]) & grid.values["floor"]])
     spread = float(np.quantile(known, 0.95)) if len(known) else 0.0
     return tolerance if spread <= tolerance else spread
 
@@ -104,7 +104,10 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
     sheet = Sheet(np.floor(everything.min(axis=0) / 10) * 10, units.per_metre)
     low, high = everything.min(axis=0) - sheet.corner, everything.max(axis=0) - sheet.corner
     size = np.maximum(high - low, 1.0) + 0.14 * float(np.max(high - low))
-    figure = new_figure(float(np.clip(WIDTH_IN * 0.78 * size[1] / size[0] + 0.75, 2.8, 5.4)))
+    wide = 0.78 * WIDTH_IN
+    height = float(np.clip(wide * size[1] / size[0], 2.0, 4.6))
+    size = np.maximum(size, [size[1] * wide / height, size[0] * height / wide])  # fill the frame with ground
+    figure = new_figure(height + 0.75)
     ax = figure.subplots()
     middle = (low + high) / 2
     ax.set_xlim(middle[0] - size[0] / 2, middle[0] + size[0] / 2)
@@ -172,7 +175,7 @@ def _cells(ax: Axes, grid: Grid, line: Alignment, sheet: Sheet, norm: Normalize,
 
 def _outline(grid: Grid, line: Alignment) -> list[np.ndarray]:
     """Rings around the cells that have a design, one per unbroken run of stations."""
-    inside = np.isfinite(grid.values["design_h"])
+    inside = grid.values["floor"]
     columns = np.flatnonzero(inside.any(axis=0))
     if len(columns) == 0:
         return []
@@ -205,8 +208,7 @@ def _station_marks(ax: Axes, line: Alignment, sheet: Sheet, grid: Grid, units: U
     """Ticks across the alignment at round stations, with their value."""
     first, last = units.to_length([grid.station[0], grid.station[-1]])
     ticks = [t for t in MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(first, last) if first <= t <= last]
-    inside = np.isfinite(grid.values["design_h"]).any(axis=1)
-    reach = float(np.abs(grid.offset[inside] if inside.any() else grid.offset).max()) + grid.cell_m[1]
+    reach = float(np.abs(grid.offset[grid.values["floor"].any(axis=1)]).max()) + 0.15
     for tick in ticks:
         ends = sheet.place(line.points(np.array(tick / units.per_metre), np.array([-reach, reach])))
         ax.plot(*ends.T, color=palette.MUTED, lw=0.6)
@@ -301,7 +303,7 @@ def deviation_map(inputs: ReportInputs, grid: Grid, units: Units) -> Figure:
     )
     pixels = (np.clip(image, 0, 1) * 255).round().astype(np.uint8)
     ax.imshow(pixels, extent=tuple(extent.tolist()), aspect="auto", interpolation="none", origin="upper")
-    inside = np.isfinite(grid.values["design_h"])
+    inside = grid.values["floor"]
     columns = np.flatnonzero(inside.any(axis=0))
     if len(columns):
         x = units.to_length(grid.station[columns])

@@ -13,7 +13,10 @@ from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.numbers import column, number
 from pipeline.report.units import Units
 from pipeline.report.words import Words
+from pipeline.surface.design import Design
 
+BESIDE_FLOOR_M = 0.3
+"""Figures show this much beside the floor: what the edge touched further out says nothing on the trench."""
 MAX_REGULAR_SECTIONS = 9
 WORST_SECTIONS = 3
 INDICATIVE_BELOW = 30
@@ -34,7 +37,7 @@ def stations_table(stations: Table, units: Units, words: Words, whole: bool = Fa
         column("sigma_common", words("columns.sigma_common"), fall, units.fine_digits),
         column("width", words("columns.width"), length, units.station_digits),
         column("covered", words("columns.covered"), "%", 0),
-        column("state", words("columns.state")),
+        *([column("state", words("columns.state"))] if whole else []),
         column("reason", words("columns.reason"), kind="why"),
     ]
     floor = np.asarray(stations["cells_floor"], float)
@@ -57,6 +60,23 @@ def stations_table(stations: Table, units: Units, words: Words, whole: bool = Fa
         }
     )
     return numbers.table(columns, rows)
+
+
+def split_stations(
+    stations: Table, units: Units, words: Words
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """The station table from the first to the last station that was dug, and the rest, or None.
+
+    Sixty rows of "not reached" before and after a morning's work would bury it.
+    """
+    everything = stations_table(stations, units, words)
+    dug = np.flatnonzero(np.isfinite(stations["deviation"]))
+    if len(dug) == 0:
+        return everything, None
+    first, last = dug[0], dug[-1] + 1
+    rows = everything["rows"]
+    beyond = {"columns": everything["columns"], "rows": rows[:first] + rows[last:]}
+    return {"columns": everything["columns"], "rows": rows[first:last]}, beyond if beyond["rows"] else None
 
 
 def checks_table(checks: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:
@@ -108,7 +128,7 @@ class Grid:
     offset: np.ndarray
     """(m,) centres, metres, right of the alignment positive."""
     values: dict[str, np.ndarray]
-    """Column -> (m, n); NaN (or an empty string) where the table has no such cell."""
+    """Column -> (m, n); NaN, or ``never touched``, where the table has no such cell. And ``floor``, bool."""
 
     @property
     def cell_m(self) -> tuple[float, float]:
@@ -116,23 +136,36 @@ class Grid:
         return _step(self.station), _step(self.offset)
 
 
-def grid_of(as_built: Table) -> Grid:
-    """The cells laid out as an image."""
-    station, at = np.unique(np.round(as_built["station"], 6), return_inverse=True)
-    offset, row = np.unique(np.round(as_built["offset"], 6), return_inverse=True)
+def grid_of(as_built: Table, design: Design | None = None) -> Grid | None:
+    """The cells on and beside the floor laid out as an image; None where there are none.
+
+    Without a design every cell is taken to be floor.
+    """
+    station, offset = np.asarray(as_built["station"], float), np.asarray(as_built["offset"], float)
+    floor = np.ones(len(station), bool) if design is None else design.is_floor(station, offset)
+    if not floor.any():
+        return None
+    reach = np.array([offset[floor].min(), offset[floor].max()]) + [-BESIDE_FLOOR_M, BESIDE_FLOOR_M]
+    keep = (offset >= reach[0]) & (offset <= reach[1])
+    keep &= (station >= station[floor].min()) & (station <= station[floor].max())
+    stations, at = np.unique(np.round(station[keep], 6), return_inverse=True)
+    offsets, row = np.unique(np.round(offset[keep], 6), return_inverse=True)
     # Stations where nothing was ever near leave no cells; without this the image would close that gap.
-    step = _step(station)
-    full = station[0] + step * np.arange(round((station[-1] - station[0]) / step) + 1)
-    at = np.round((station[at] - station[0]) / step).astype(int)
+    step = _step(stations)
+    full = stations[0] + step * np.arange(round((stations[-1] - stations[0]) / step) + 1)
+    at = np.round((stations[at] - stations[0]) / step).astype(int)
     values: dict[str, np.ndarray] = {}
     for name in ("h", "design_h", "deviation", "sigma_own", "sigma_common"):
-        image = np.full((len(offset), len(full)), np.nan)
-        image[row, at] = as_built[name]
+        image = np.full((len(offsets), len(full)), np.nan)
+        image[row, at] = as_built[name][keep]
         values[name] = image
-    state = np.full((len(offset), len(full)), "never touched", dtype=object)
-    state[row, at] = as_built["state"]
+    state = np.full((len(offsets), len(full)), "never touched", dtype=object)
+    state[row, at] = as_built["state"][keep]
     values["state"] = state
-    return Grid(full, offset, values)
+    on_floor = np.zeros((len(offsets), len(full)), bool)
+    on_floor[row, at] = floor[keep]
+    values["floor"] = on_floor & np.isfinite(values["design_h"])
+    return Grid(full, offsets, values)
 
 
 def _step(centres: np.ndarray) -> float:
@@ -150,12 +183,14 @@ class Section:
     h: np.ndarray
     design_h: np.ndarray
     sigma: np.ndarray
+    floor: np.ndarray
+    """Which of the offsets are on the floor."""
 
 
 def sections_of(inputs: ReportInputs, grid: Grid) -> list[Section]:
     """Regular cross sections, at most nine, and those of the three worst stations, by station."""
     stations = inputs.table("stations")
-    cut = grid.station[np.isfinite(grid.values["h"]).any(axis=0)]
+    cut = grid.station[(np.isfinite(grid.values["h"]) & grid.values["floor"]).any(axis=0)]
     if len(cut) == 0:
         return []
     step = inputs.site.report.cross_section_step_m
@@ -169,11 +204,11 @@ def sections_of(inputs: ReportInputs, grid: Grid) -> list[Section]:
         dug = np.flatnonzero(np.isfinite(stations["deviation"]))
         worst = dug[np.argsort(-np.abs(stations["deviation"][dug]), kind="stable")][:WORST_SECTIONS]
         wanted |= {round(float(station), 6): "worst" for station in stations["station"][worst]}
-    sections = [_section(grid, station, why) for station, why in sorted(wanted.items())]
-    return [section for section in sections if np.isfinite(section.h).any()]
+    sections = [_section(grid, station, why, inputs.design) for station, why in sorted(wanted.items())]
+    return [section for section in sections if np.isfinite(section.h[section.floor]).any()]
 
 
-def _section(grid: Grid, station: float, why: str) -> Section:
+def _section(grid: Grid, station: float, why: str, design: Design | None) -> Section:
     """The mean of the cells that touch a station, which lies as often on their border as inside one."""
     near = np.abs(grid.station - station) <= grid.cell_m[0] * (0.5 + 1e-6)
     means = {}
@@ -185,7 +220,11 @@ def _section(grid: Grid, station: float, why: str) -> Section:
             count > 0, np.where(known, part, 0.0).sum(axis=1) / np.maximum(count, 1), np.nan
         )
     sigma = np.hypot(means["sigma_own"], means["sigma_common"])
-    return Section(station, why, grid.offset, means["h"], means["design_h"], sigma)
+    if design is not None:
+        means["design_h"] = design.elevation(np.full(len(grid.offset), station), grid.offset)
+    floor = np.any(grid.values["floor"][:, near], axis=1)
+    assert isinstance(floor, np.ndarray)
+    return Section(station, why, grid.offset, means["h"], means["design_h"], sigma, floor)
 
 
 def sections_table(sections: list[Section], units: Units, words: Words) -> dict[str, Any]:
@@ -230,7 +269,7 @@ def cells_table(inputs: ReportInputs, grid: Grid, units: Units, words: Words) ->
     rows = []
     for number_ in np.unique(block):
         part = grid.values["deviation"][:, block == number_]
-        known = part[np.isfinite(part)]
+        known = part[np.isfinite(part) & grid.values["floor"][:, block == number_]]
         low, mean, high = (known.min(), known.mean(), known.max()) if len(known) else (np.nan,) * 3
         rows.append(
             {

@@ -61,10 +61,11 @@ def render(inputs: ReportInputs, language: str = "en") -> Page:
 def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str, Any], dict[str, str]]:
     """Everything that is printed, and the figures as SVG by name."""
     stations, checks, as_built = (inputs.table(name) for name in ("stations", "checks", "as_built"))
-    grid = None if as_built is None else measured.grid_of(as_built)
+    grid = None if as_built is None else measured.grid_of(as_built, inputs.design)
     timeline = evidence.timeline_of(inputs)
     statistics = measured.check_statistics(inputs, units)
     sections = [] if grid is None else measured.sections_of(inputs, grid)
+    main, beyond = (None, None) if stations is None else measured.split_stations(stations, units, words)
     content: dict[str, Any] = {
         "format": FORMAT,
         "language": words.language,
@@ -76,7 +77,8 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "surveyed": facts.surveyed(inputs, units, words),
         "summary": facts.summary(inputs, units, words, statistics),
         "attention": attention(inputs, units, words, timeline, statistics),
-        "stations": None if stations is None else measured.stations_table(stations, units, words),
+        "stations": main,
+        "stations_beyond": beyond,
         "cells": None if grid is None else measured.cells_table(inputs, grid, units, words),
         "cross_sections": measured.sections_table(sections, units, words) if sections else None,
         "checks": None if checks is None else measured.checks_table(checks, units, words),
@@ -144,7 +146,7 @@ def _figures(
     with house_style():
         line = inputs.alignment
         if grid is not None and line is not None:
-            cut = grid.station[np.isfinite(grid.values["h"]).any(axis=0)]
+            cut = grid.station[(np.isfinite(grid.values["h"]) & grid.values["floor"]).any(axis=0)]
             ends = (cut[0], cut[-1]) if len(cut) else (grid.station[0], grid.station[-1])
             add(
                 "plan",
@@ -179,7 +181,7 @@ def _figures(
             add("cross_sections", "as_built", None)
         if grid is not None:
             count = {
-                name: int((grid.values["state"] == name).sum())
+                name: int((grid.values["floor"] & (grid.values["state"] == name)).sum())
                 for name in ("cut", "passed over", "never touched")
             }
             add(

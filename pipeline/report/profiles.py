@@ -14,6 +14,7 @@ from pipeline.report.drawing import WIDTH_IN, decimated, new_figure
 from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.measured import Grid, Section
 from pipeline.report.units import Units, text_of
+from pipeline.surface.design import Design
 
 SIGMAS = 2.0
 """Half width of every ribbon and bar."""
@@ -48,16 +49,26 @@ def long_section(inputs: ReportInputs, stations: Table, grid: Grid | None, units
     _deviations(axes[1], x, deviation, half, (low, high), grid, units)
     checks = inputs.table("checks")
     if checks is not None:
-        _shots(axes[0], axes[1], checks, stations, units)
+        _shots(axes[0], axes[1], checks, stations, inputs.design, units)
     _verdicts(axes[2], stations, units)
     axes[2].set_xlabel(f"Station [{units.length}]")
-    edge = 0.02 * (np.nanmax(x) - np.nanmin(x) or 1.0)
-    axes[2].set_xlim(np.nanmin(x) - edge, np.nanmax(x) + edge)
+    axes[2].set_xlim(*_span_shown(x, deviation))
     for ax in axes[:2]:
         # Beside the axes, never on a line: the station axis is the dear one here, so above.
         ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, borderaxespad=0.2, handlelength=1.6)
     figure.align_ylabels(axes)
     return figure
+
+
+def _span_shown(x: np.ndarray, deviation: np.ndarray) -> tuple[float, float]:
+    """The dug stations and a fifth of their length around, never beyond the design."""
+    low, high = float(np.nanmin(x)), float(np.nanmax(x))
+    edge = 0.02 * (high - low or 1.0)
+    dug = x[np.isfinite(deviation)]
+    if len(dug) == 0:
+        return low - edge, high + edge
+    around = 0.2 * max(float(np.ptp(dug)), 4 * edge)
+    return max(low - edge, dug.min() - around), min(high + edge, dug.max() + around)
 
 
 def _elevations(ax: Axes, x, h, design, half, tolerance: tuple[float, float], units: Units) -> None:
@@ -73,6 +84,11 @@ def _elevations(ax: Axes, x, h, design, half, tolerance: tuple[float, float], un
     ax.plot(x, units.to_length(design), color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)), label="design")
     ax.fill_between(x, units.to_length(h - half), units.to_length(h + half), color=palette.RIBBON, lw=0)
     ax.plot(x, units.to_length(h), color=palette.AS_BUILT, label="as-built")
+    first, last = _span_shown(x, h)
+    view = (x >= first) & (x <= last)
+    known = np.concatenate([design[view] - low, design[view] + high, (h - half)[view], (h + half)[view]])
+    bottom, top = units.to_length([np.nanmin(known), np.nanmax(known)])
+    ax.set_ylim(bottom - 0.1 * (top - bottom), top + 0.1 * (top - bottom))
     ax.set_ylabel(f"Elevation [{units.length}]")
     ax.set_title("Elevation")
 
@@ -133,9 +149,13 @@ def _centre_line(grid: Grid) -> tuple[np.ndarray, np.ndarray]:
     return grid.station, grid.values["deviation"][row]
 
 
-def _shots(above: Axes, below: Axes, checks: Table, stations: Table, units: Units) -> None:
+def _shots(
+    above: Axes, below: Axes, checks: Table, stations: Table, design: Design | None, units: Units
+) -> None:
     """Check shots: their elevation above, and below where the shot lies against the design at its station."""
     on = np.isfinite(checks["station"])
+    if design is not None:
+        on &= design.is_floor(checks["station"], checks["offset"])
     station, h = np.asarray(checks["station"], float)[on], np.asarray(checks["h"], float)[on]
     sigma = np.asarray(checks["sigma_ts"], float)[on]
     marks: dict[str, Any] = {
@@ -155,10 +175,10 @@ def _shots(above: Axes, below: Axes, checks: Table, stations: Table, units: Unit
         **marks,
     )
     compared = np.asarray(checks["result"])[on] == "compared"
-    design = np.interp(station, stations["station"], stations["design_h"], left=np.nan, right=np.nan)
+    level = np.interp(station, stations["station"], stations["design_h"], left=np.nan, right=np.nan)
     below.errorbar(
         units.to_length(station[compared]),
-        units.to_deviation((h - design)[compared]),
+        units.to_deviation((h - level)[compared]),
         SIGMAS * units.to_deviation(sigma[compared]),
         elinewidth=0.8,
         label="check shots",
@@ -200,10 +220,11 @@ def cross_sections(inputs: ReportInputs, sections: list[Section], units: Units) 
     for ax, section, (bottom, top) in zip(axes.flat, sections, reach):
         x, half = units.to_length(section.offset), SIGMAS * section.sigma
         d, h = section.design_h, section.h
+        floor = np.where(section.floor, d, np.nan)
         ax.fill_between(
             x,
-            units.to_length(d - low),
-            units.to_length(d + high),
+            units.to_length(floor - low),
+            units.to_length(floor + high),
             color=palette.BAND,
             lw=0,
             label="tolerance",
@@ -240,10 +261,9 @@ def cross_sections(inputs: ReportInputs, sections: list[Section], units: Units) 
 
 
 def _limits(section: Section, low: float, high: float) -> tuple[float, float]:
-    half = SIGMAS * section.sigma
-    known = np.concatenate(
-        [section.design_h - low, section.design_h + high, section.h - half, section.h + half]
-    )
+    on = section.floor
+    d, h, half = section.design_h[on], section.h[on], SIGMAS * section.sigma[on]
+    known = np.concatenate([d - low, d + high, h - half, h + half])
     return float(np.nanmin(known)), float(np.nanmax(known))
 
 

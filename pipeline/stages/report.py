@@ -79,7 +79,7 @@ def gather(job: Job) -> ReportInputs:
         except ArtefactError as error:
             facts[file], missing[file] = {}, str(error)
     cameras = set(job.parts("detections"))
-    design = job.files["design"]
+    design, alignment = read_design(job.files["design"].path, job.site)
     manifests = {}
     for stage in STAGES:
         if stage.name != "report" and (manifest := job.folder.manifest(stage.name)) is not None:
@@ -96,7 +96,8 @@ def gather(job: Job) -> ReportInputs:
         machine_file=_file(job.machine_source),
         site_file=_file(job.site_source),
         named_files={key: FileSource(file.name, "site", file.sha256) for key, file in job.files.items()},
-        alignment=read_design(design.path, job.site)[1],
+        alignment=alignment,
+        design=design,
         tables=tables,
         detections={
             camera: job.read_table("detections", DETECTION_COLUMNS, part=camera)
