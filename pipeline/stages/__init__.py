@@ -55,7 +55,7 @@ def _reading(job: Job) -> Settings:
             for name, camera in job.machine.cameras.items()
         },
         "sensors": {
-            name: {"topic": sensor.topic, "field": sensor.field}
+            name: {"topic": sensor.topic, "field": sensor.field, "joint": sensor.joint}
             for name, sensor in job.machine.sensors.items()
         },
     }
