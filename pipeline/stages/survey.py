@@ -100,6 +100,11 @@ def run(job: Job, progress: Progress) -> Counts:
     job.write_table("as_built", table.columns_of_as_built(built, NULL_INT))
     job.write_table("stations", table.columns_of_stations(stations))
     checks: dict[str, Any] | None = None
+    if shots is not None and shots.mended:
+        progress.warn(
+            f"{job.files['checks'].name}: in {len(shots.mended)} lines (the first is line {shots.mended[0]}) the "
+            "separator after the point's name is missing; they were read as if it were there"
+        )
     if shots is not None and len(shots):
         assert site.checks is not None
         comparison = compare(shots, built, alignment, site.checks.sigma_mm / 1000)

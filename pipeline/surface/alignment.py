@@ -137,10 +137,7 @@ class Alignment:
         center = 0.5 * (en.min(axis=0) + en.max(axis=0))
         reach = np.max(np.linalg.norm(en - center, axis=1))
         element_center, element_reach = self._circles()
-        distance = np.linalg.norm(element_center - center, axis=1)
-        nearest_possible = distance - element_reach - reach
-        # The end elements reach to infinity along their tangents.
-        nearest_possible[[0, -1]] = 0.0
+        nearest_possible = np.linalg.norm(element_center - center, axis=1) - element_reach - reach
         surely_within = np.min(np.linalg.norm(self.start - center, axis=1)) + reach
         candidates = np.flatnonzero(nearest_possible <= surely_within)
 
@@ -148,6 +145,7 @@ class Alignment:
         station, offset = np.empty(len(en)), np.empty(len(en))
         for k in candidates:
             along, foot, direction = self._foot(int(k), en)
+            length = self.station[k + 1] - self.station[k]
             away = en - foot
             distance = np.hypot(away[:, 0], away[:, 1])
             nearer = distance < best
@@ -155,8 +153,20 @@ class Alignment:
             # At a corner the side is told by the bisector of both tangents; either one alone is wrong behind a
             # corner sharper than 90 degrees.
             side = away[:, 0] * direction[:, 1] - away[:, 1] * direction[:, 0]
-            station[nearer] = (self.station[k] + along)[nearer]
+            # Exactly the border's station at an end, so that who is nearest to one can be told.
+            station[nearer] = np.where(along >= length, self.station[k + 1], self.station[k] + along)[nearer]
             offset[nearer] = np.where(side < 0, -distance, distance)[nearer]
+        # Only what is nearest to an end goes on along its tangent: the tangent may cross the alignment elsewhere.
+        final = len(self.turn) - 1
+        for at, element, sign in ((self.start_station, 0, -1.0), (self.end_station, final, 1.0)):
+            rows = np.flatnonzero(station == at)
+            along = np.array([0.0 if sign < 0 else self.station[-1] - self.station[-2]])
+            end, tangent = self._walk(np.array([element]), along)
+            away = en[rows] - end[0]
+            beyond = away @ tangent[0]
+            out = beyond * sign > 0
+            station[rows[out]] = at + beyond[out]
+            offset[rows[out]] = (away[:, 0] * tangent[0, 1] - away[:, 1] * tangent[0, 0])[out]
         return station, offset
 
     def _circles(self) -> tuple[np.ndarray, np.ndarray]:
@@ -170,40 +180,26 @@ class Alignment:
         length = float(self.station[k + 1] - self.station[k])
         first, last = k == 0, k == len(self.turn) - 1
         ends, tangents = self._walk(np.array([k, k]), np.array([0.0, length]))
-        before = (en - ends[0]) @ tangents[0]
-        after = (en - ends[1]) @ tangents[1]
         if self.turn[k] == 0:
-            along = before
+            along = (en - ends[0]) @ tangents[0]
         else:
             radial = en - self.center[k]
             start = self.start[k] - self.center[k]
             radius = float(np.hypot(*start))
-            swept = np.arctan2(start[0] * radial[:, 1] - start[1] * radial[:, 0], radial @ start) * -float(
-                self.turn[k]
-            )
-            total = length / radius
+            swept = np.arctan2(start[0] * radial[:, 1] - start[1] * radial[:, 0], radial @ start)
+            swept *= -float(self.turn[k])
             # The angle is only known modulo a turn: take the one nearest to the arc's middle.
-            swept = swept - 2 * np.pi * np.round((swept - 0.5 * total) / (2 * np.pi))
-            along = swept * radius
-            # Off an arc's end the tangent extension decides, not the angle about the centre.
-            if first:
-                along = np.where(along < 0, np.minimum(before, 0.0), along)
-            if last:
-                along = np.where(along > length, length + np.maximum(after, 0.0), along)
-        low, high = (-np.inf if first else 0.0), (np.inf if last else length)
-        clamped = np.clip(along, low, high)
-        foot, direction = self._walk(np.full(len(en), k), np.clip(clamped, 0.0, length))
-        beyond = clamped - np.clip(clamped, 0.0, length)
-        foot = foot + beyond[:, None] * direction
+            middle = 0.5 * length / radius
+            along = (swept - 2 * np.pi * np.round((swept - middle) / (2 * np.pi))) * radius
+        inside = np.clip(along, 0.0, length)
+        foot, direction = self._walk(np.full(len(en), k), inside)
         if not first:
-            direction = np.where(
-                (along <= 0.0)[:, None], tangents[0] + self._tangent(k - 1, at_end=True), direction
-            )
+            corner = tangents[0] + self._tangent(k - 1, at_end=True)
+            direction = np.where((along <= 0.0)[:, None], corner, direction)
         if not last:
-            direction = np.where(
-                (along >= length)[:, None], tangents[1] + self._tangent(k + 1, at_end=False), direction
-            )
-        return clamped, foot, direction
+            corner = tangents[1] + self._tangent(k + 1, at_end=False)
+            direction = np.where((along >= length)[:, None], corner, direction)
+        return inside, foot, direction
 
     def _tangent(self, k: int, at_end: bool) -> np.ndarray:
         along = float(self.station[k + 1] - self.station[k]) if at_end else 0.0

@@ -48,6 +48,8 @@ class Shots:
     """(n,) descriptions, strings, empty where the file has none."""
     p_grid: np.ndarray
     """(n, 3) easting, northing, elevation; grid metres."""
+    mended: tuple[int, ...] = ()
+    """Lines of the file in which the separator after the point's name was missing and was put back."""
 
     def __len__(self) -> int:
         return len(self.point)
@@ -92,6 +94,7 @@ def read_shots(path: Path, order: str, metres_per_unit: float) -> Shots:
         )
     rows = csv.reader(io.StringIO(text), delimiter=separator)
     point, code, coordinates = [], [], []
+    mended: list[int] = []
     heading = True
     try:
         for row in rows:
@@ -104,6 +107,9 @@ def read_shots(path: Path, order: str, metres_per_unit: float) -> Shots:
                 continue
             heading = False
             where = f"{path.name}:{rows.line_num}"
+            if whole := _with_separator(cells):
+                cells = whole
+                mended.append(rows.line_num)
             if len(cells) < 4:
                 raise SurfaceError(
                     f"{where}: expected point, two coordinates and elevation, found {len(cells)} columns"
@@ -117,7 +123,7 @@ def read_shots(path: Path, order: str, metres_per_unit: float) -> Shots:
     except csv.Error as error:
         raise SurfaceError(f"{path.name}:{rows.line_num}: not readable as CSV ({error})") from None
     p_grid = np.array(coordinates, dtype=np.float64).reshape(-1, 3) * metres_per_unit
-    return Shots(np.array(point, dtype=object), np.array(code, dtype=object), p_grid)
+    return Shots(np.array(point, dtype=object), np.array(code, dtype=object), p_grid, tuple(mended))
 
 
 def check_order(shots: Shots, low_en: np.ndarray, high_en: np.ndarray, order: str, source: str) -> None:
@@ -175,6 +181,18 @@ def _check_heading(cells: list[str], order: str, source: str) -> None:
             f"{source}: its headings are {', '.join(cells[:4])}, but site.toml says checks.order = '{order}'; "
             f"write '{other}'"
         )
+
+
+def _with_separator(cells: list[str]) -> list[str] | None:
+    """The cells of a line like ``FS968 B 989.18 | 996.05 | 99.93 |`` with its name and first number parted, or None.
+
+    Total stations write such lines where a name fills its field. Only one reading of them makes three numbers.
+    """
+    name, _, number = cells[0].rpartition(" ")
+    numbers = [bool(_NUMBER.fullmatch(cell)) for cell in cells[1:4]]
+    if name and _NUMBER.fullmatch(number) and numbers[:2] == [True, True] and numbers[2:] != [True]:
+        return [name.strip(), number, *cells[1:]]
+    return None
 
 
 def _number(cell: str, separator: str, where: str) -> float:
