@@ -113,7 +113,12 @@ class TinDesign:
         self._tree = shapely.STRtree(
             shapely.box(*self._corners[:, :, :2].min(axis=1).T, *self._corners[:, :, :2].max(axis=1).T)
         )
-        self._station = np.arange(alignment.start_station, alignment.end_station + 0.25, 0.25)
+        # A surface often ends with its alignment, and rounding in the file puts the end on either side.
+        first, last = alignment.start_station, alignment.end_station
+        inside = min(0.001, 0.25 * alignment.length)
+        self._station = np.unique(
+            np.append(np.arange(first, last, 0.25), [first + inside, last - inside, last])
+        )
         on_axis, face = self._find(alignment.points(self._station, 0.0))
         if not np.any(face >= 0):
             raise SurfaceError(

@@ -183,6 +183,7 @@ def test_a_landxml_design_and_the_same_profile_say_the_same(tmp_path):
     assert np.allclose(surface.elevation(station, offset), row.elevation(station, offset), rtol=0, atol=1e-6)
     assert np.array_equal(surface.is_floor(station, offset), row.is_floor(station, offset))
     assert alignment.length == 20
+    assert surface.station_range() == pytest.approx((0, 20), abs=0.0011)
 
 
 def test_the_alignment_of_the_file_is_used_where_site_toml_has_none(tmp_path):
