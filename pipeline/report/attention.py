@@ -141,19 +141,25 @@ def _of_stations(inputs: ReportInputs, units: Units, words: Words) -> list[Remar
         sentence = words(
             "attention.not_capable",
             n=len(incapable),
+            all=len(verdict),
             u=deviation_text(float(np.median(u[incapable])), units, signed=False),
         )
         remarks.append(Remark(GRAVE, sentence, "error_budget"))
     if unsure := int((verdict == "CANNOT TELL").sum()):
-        remarks.append(Remark(SERIOUS, words("attention.cannot_tell", n=unsure), "stations"))
+        remarks.append(
+            Remark(SERIOUS, words("attention.cannot_tell", n=unsure, all=len(verdict)), "stations")
+        )
     gone = np.flatnonzero(verdict == "NOT REACHED")
     if len(gone):
         sentence = words(
-            "attention.not_reached", n=len(gone), spans=_spans(stations["station"], gone, units, words)
+            "attention.not_reached",
+            n=len(gone),
+            all=len(verdict),
+            spans=_spans(stations["station"], gone, units, words),
         )
         remarks.append(Remark(SERIOUS, sentence, "stations"))
     if partly := int((stations["state"] == "partly cut").sum()):
-        remarks.append(Remark(WORTH, words("attention.partly", n=partly), "stations"))
+        remarks.append(Remark(WORTH, words("attention.partly", n=partly, all=len(verdict)), "stations"))
     return remarks
 
 
@@ -180,7 +186,7 @@ def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number]
     remarks = []
     z = checks["z"][np.isfinite(checks["z"])]
     if off := int((np.abs(z) > CHECK_OFF_SIGMAS).sum()):
-        remarks.append(Remark(GRAVE, words("attention.check_off", n=off), "checks"))
+        remarks.append(Remark(GRAVE, words("attention.check_off", n=off, all=len(z)), "checks"))
     value = statistics["reduced_chi_square"]["value"]
     if value is not None and value > CHI_SQUARE_HIGH:
         remarks.append(Remark(SERIOUS, words("attention.chi_square", value=text_of(value, 2)), "checks"))
@@ -191,9 +197,7 @@ def _of_network(inputs: ReportInputs, words: Words) -> list[Remark]:
     remarks = []
     residuals = inputs.table("residuals")
     if residuals is not None:
-        unseen = sorted(
-            set(inputs.site.benchmarks) - set(np.unique(residuals["marker"].astype(str)).tolist())
-        )
+        unseen = sorted(set(inputs.site.benchmarks) - set(residuals["marker"].tolist()))
         if unseen:
             sentence = words("attention.benchmark_unseen", names=", ".join(unseen))
             remarks.append(Remark(SERIOUS, sentence, "quality"))

@@ -25,6 +25,13 @@ from pipeline.surface.alignment import Alignment
 
 MAX_PLAN_COLUMNS = 1500
 MAX_MAP_COLUMNS = 1500
+LABELS = (
+    ((0, 5), "center", "bottom"),
+    ((6, 0), "left", "center"),
+    ((0, -6), "center", "top"),
+    ((-6, 0), "right", "center"),
+)
+"""Where the names of neighbouring benchmarks go in turn, so that close ones do not cover each other."""
 
 
 def drawn_line(line: Alignment) -> np.ndarray:
@@ -127,7 +134,8 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
     for i, (name, en) in enumerate(marks.items()):
         at = sheet.place(en)
         ax.plot(*at, "^", ms=6, color=palette.INK, ls="", label="benchmark" if i == 0 else None)
-        ax.annotate(name, tuple(at), (0, 5), textcoords="offset points", ha="center", fontsize=7)
+        (dx, dy), ha, va = LABELS[i % len(LABELS)]
+        ax.annotate(name, tuple(at), (dx, dy), textcoords="offset points", ha=ha, va=va, fontsize=7)
     for axis, start in ((ax.xaxis, sheet.corner[0]), (ax.yaxis, sheet.corner[1])):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=2))
         axis.set_major_formatter(FuncFormatter(lambda value, _, start=start: _coordinate(value + start)))

@@ -200,7 +200,15 @@ def test_at_most_five_remarks_stand_first_and_none_is_lost(page):
     attention = page.content["attention"]
     assert len(attention["items"]) == 5
     said = " ".join(item["sentence"] for item in attention["items"] + attention["more"])
-    for word in ("14.2 s lost", "stations fail", "cannot be decided", "not reached", "BM3", "BM2", "gaps"):
+    for word in (
+        "14.2 s lost",
+        "Out of tolerance: 2 of 36",
+        "Cannot be decided: 2",
+        "Not reached",
+        "BM3",
+        "BM2",
+        "gaps: 1",
+    ):
         assert word in said
     assert said.count("The recording ends") == 1
 
@@ -214,7 +222,7 @@ def test_an_unknown_measurement_is_named_when_u_exceeds_the_tolerance():
     inputs = made_up_inputs()
     inputs.tables["stations"]["expanded_uncertainty"][:5] = 0.060
     said = [item["sentence"] for item in render(inputs).content["attention"]["items"]]
-    assert any("not capable at 5 stations" in sentence and "60 mm" in sentence for sentence in said)
+    assert any("not capable at 5 of 36 stations" in sentence and "60 mm" in sentence for sentence in said)
 
 
 def test_gaps_are_measured_from_the_last_seen_instant_to_the_next(page):
