@@ -100,8 +100,6 @@ def svg_of(figure: Figure, name: str, title: str, description: str) -> str:
     """
     buffer = io.StringIO()
     FigureCanvasSVG(figure)
-    # Constrained layout sees the room that axes of equal scale need only in its second pass.
-    figure.draw_without_rendering()
     nothing = dict.fromkeys(("Date", "Creator", "Format", "Type"))
     figure.savefig(buffer, format="svg", metadata=nothing)
     text = buffer.getvalue()

@@ -119,7 +119,6 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
     middle = (low + high) / 2
     ax.set_xlim(middle[0] - size[0] / 2, middle[0] + size[0] / 2)
     ax.set_ylim(middle[1] - size[1] / 2, middle[1] + size[1] / 2)
-    ax.set_aspect("equal", adjustable="box")
     reach = scale_of(inputs, grid)
     norm = Normalize(-float(units.to_deviation(reach)), float(units.to_deviation(reach)))
     _cells(ax, grid, line, sheet, norm, units)
@@ -151,9 +150,25 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
     handles += [h for h, name in zip(known, names) if name in ("check shot", "benchmark")]
     figure.legend(handles=handles, loc="outside upper left", ncols=4, handlelength=2.2)
     _colour_bar(figure, ax, norm, inputs, units)
+    _to_scale(figure, ax)
     busy = [sheet.place(part) for part in corners]
     _north_and_scale(ax, np.concatenate(busy), units)
     return figure
+
+
+def _to_scale(figure: Figure, ax: Axes) -> None:
+    """Show as much more ground as makes both axes of one scale, and freeze the layout.
+
+    matplotlib's own equal aspect moves the axes after the layout has been made, and labels off the figure.
+    """
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    frame = ax.get_window_extent()
+    (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
+    scale = max((right - left) / frame.width, (top - bottom) / frame.height)
+    x, y = (left + right) / 2, (bottom + top) / 2
+    ax.set_xlim(x - scale * frame.width / 2, x + scale * frame.width / 2)
+    ax.set_ylim(y - scale * frame.height / 2, y + scale * frame.height / 2)
 
 
 def _coordinate(value: float) -> str:

@@ -1,8 +1,12 @@
 """Figures keep spikes and gaps, clash with nothing on the page, and escape what they are told."""
 
 import numpy as np
+import pytest
 
+from pipeline.report import maps, measured, profiles
 from pipeline.report.drawing import decimated, house_style, new_figure, svg_of
+from pipeline.report.units import units_of
+from tests.report.conftest import made_up_inputs
 from tests.report.pages import PageReader
 
 
@@ -52,3 +56,28 @@ def test_a_users_own_matplotlib_settings_change_nothing():
     before = drawn()
     with matplotlib.rc_context({"lines.linewidth": 9, "font.size": 30}):
         assert drawn() == before
+
+
+@pytest.mark.parametrize("unit", ["m", "us_survey_foot"])
+def test_no_label_is_clipped_and_the_plan_is_to_scale(unit):
+    inputs = made_up_inputs(unit)
+    units = units_of(unit, inputs.site.grid.metres_per_unit)
+    grid = measured.grid_of(inputs.tables["as_built"])
+    with house_style():
+        plan = maps.plan(inputs, inputs.alignment, grid, units)
+        figures = [
+            plan,
+            maps.deviation_map(inputs, grid, units),
+            profiles.long_section(inputs, inputs.tables["stations"], grid, units),
+            profiles.cross_sections(inputs, measured.sections_of(inputs, grid), units),
+            profiles.check_shots(inputs.tables["checks"], units),
+        ]
+        for figure in figures:
+            figure.draw_without_rendering()
+            box, (width, height) = figure.get_tightbbox(), figure.get_size_inches()
+            assert box.x0 > -0.02 and box.y0 > -0.02, figure.axes[0].get_title()
+            assert box.x1 < width + 0.02 and box.y1 < height + 0.02
+        ax = plan.axes[0]
+        frame = ax.get_window_extent()
+        east, north = np.ptp(ax.get_xlim()) / frame.width, np.ptp(ax.get_ylim()) / frame.height
+        assert east == pytest.approx(north, rel=1e-6)
