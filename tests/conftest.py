@@ -77,9 +77,9 @@ def recorded(shared_folder) -> Path:
     def record(folder: Path) -> None:
         from dataclasses import replace
 
-        from pipeline.synthetic import command, recording
+        from pipeline.synthetic import recording, specification
 
-        spec = replace(command.site("trench", minutes=0.3), name="short", rate_hz=3.0)
+        spec = replace(specification.trench(), name="short", cycles=1, rate_hz=3.0)
         recording.record(spec, 3, folder, jobs=1)
 
     return once(shared_folder / "recorded", record)
