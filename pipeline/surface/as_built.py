@@ -10,6 +10,8 @@ The rule, printed on the report:
 * A cell is also **passed over** when more than half of the crossed cells around it (within `around_m`) lie more than
   `step_m` lower, seen relative to the design: the edge flew over a hole there, or a ridge was left. A ramp stays cut,
   because on a ramp no more than half of the neighbours are lower.
+* Beside the floor a pass more than `contact_m` below the designed slope counts only down at the floor's own level:
+  designed slopes do not end where the ground does, and above it the edge is in the air.
 * **Never touched**: no pass over its centre at any height. It is a gap and is shown as one.
 """
 
@@ -150,7 +152,10 @@ def as_built(
     shape = (grid.rows, grid.columns)
     h = chosen.height.reshape(shape)
     kept = np.isfinite(h)
-    flown = _lower_around(h - reference, rule.step_m, max(1, round(rule.around_m / cell_m)))
+    # A profile's side slopes go on upwards for ever; what is far below one of them and above the floor is the open
+    # ground beside the trench, which the edge may have crossed in the air.
+    beside = ~floor & (h < design_h - rule.contact_m) & (h > level + rule.contact_m)
+    flown = beside | _lower_around(h - reference, rule.step_m, max(1, round(rule.around_m / cell_m)))
     cut = kept & ~flown
     state = np.where(cut, 2, np.where(passes.crossed.reshape(shape) > 0, 1, 0)).astype(np.uint8)
     of_pass = np.maximum(chosen.lowest_pass, 0)

@@ -56,7 +56,10 @@ class CheckSummary:
 
 
 def compare(shots: Shots, built: AsBuilt, alignment: Alignment, sigma_ts_m: float) -> Comparison:
-    """Each shot against the cut cells around it.
+    """Each shot against the cut cells of the floor around it.
+
+    Beside the floor nothing is compared: a control point there, on which the bucket was set down, is no shot of ground
+    that was cut.
 
     Over the cells within `RADIUS_M` the deviation from the design is averaged and the design added at the shot, so
     that a floor with a gradient is not compared with the wrong place; outside the design plain elevations are.
@@ -98,7 +101,7 @@ def compare(shots: Shots, built: AsBuilt, alignment: Alignment, sigma_ts_m: floa
         along, across = np.meshgrid(grid.station[block[0]], grid.offset[block[1]], indexing="ij")
         away = np.hypot(along - station[i], across - offset[i])
         # The nearest cell counts even where cells are larger than the radius.
-        near = built.cut[block] & (away <= max(RADIUS_M, 0.75 * grid.cell_m))
+        near = built.cut[block] & built.floor[block] & (away <= max(RADIUS_M, 0.75 * grid.cell_m))
         if not np.any(near):
             continue
         result[i] = COMPARED

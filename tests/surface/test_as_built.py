@@ -75,6 +75,16 @@ def test_over_dug_width_beside_vertical_walls_is_seen_outside_the_design(trench)
     assert not built.floor[middle][:, beside].any()
 
 
+def test_open_ground_under_the_prolonged_side_slope_is_not_a_cut(trench):
+    sloped = replace(trench.design, side_slope=np.array([0.5, 0.5]))
+    # A bucket set down at 51.5 m, 1.5 m beside the axis, where the slope would be at 52 m; and one on the slope.
+    for height, state in ((51.5, OVER), (51.9, CUT), (50.1, CUT)):
+        edge = trench.edge(np.arange(0, 3, 0.1), np.linspace(3, 6, 30), 1.5, height, width=0.2)
+        built = as_built(edge, trench.alignment, sloped, 0.05)
+        under = built.state[rows(built, 3.1, 5.8)][:, np.abs(built.grid.offset - 1.5) < 0.03]
+        assert np.all(under == state), height
+
+
 def test_the_last_pass_is_the_surface_of_placed_material(trench):
     edge = trench.passes([49.9, 50.0, 50.1, 52.0])
     lowest = as_built(edge, trench.alignment, trench.design, 0.1)

@@ -134,6 +134,12 @@ def test_shots_where_nothing_was_cut_are_kept_and_not_compared(trench, built):
     assert summarise(shots, found).n == 0 and summarise(shots, found).indicative_only
 
 
+def test_a_control_point_beside_the_floor_is_not_a_shot_of_the_floor(trench):
+    wide = as_built(trench.passes([50.0], width=2.0), trench.alignment, trench.design, 0.05)
+    shots = shots_at(trench, [5.0, 5.0], [0.0, 0.8], 50.0)
+    assert compare(shots, wide, trench.alignment, 0.002).result.tolist() == [COMPARED, OUTSIDE_CUT]
+
+
 def test_a_gradient_of_the_floor_does_not_enter_the_difference(trench):
     """At the end of the cut the cells around a shot lie all on one side of it."""
     steep = ProfileDesign("s", np.array([0.0, 10.0]), np.array([50.0, 51.0]), np.ones(2), np.zeros(2))
