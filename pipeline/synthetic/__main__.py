@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> None:
         _make(
             wanted.jobs,
             folder=wanted.folder,
-            site_name=wanted.site or "trench",
+            site=wanted.site or "trench",
             minutes=wanted.minutes,
             size=wanted.size or ("640" if wanted.minutes is None and wanted.seed is None else "1280"),
             seed=command.SAMPLE_SEED if wanted.seed is None else wanted.seed,

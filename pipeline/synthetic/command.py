@@ -13,7 +13,7 @@ from pipeline.synthetic.cycle import CYCLE_S, TRAM_S
 from pipeline.synthetic.specification import Specification
 
 SIZES = {"640": (640, 480, 850.0), "1280": (1280, 960, 1731.0)}
-SAMPLE_SEED = 14
+SAMPLE_SEED = 17
 FOLDER = Path("sample_logs")
 DRAWN = FOLDER / "generated"
 """Where drawn logs go; not committed."""
@@ -21,14 +21,14 @@ DRAWN = FOLDER / "generated"
 Progress = Callable[[int, int], None]
 
 
-def site(name: str = "trench", minutes: float | None = None, size: str = "640") -> Specification:
+def specification_of(site: str = "trench", minutes: float | None = None, size: str = "640") -> Specification:
     """The specification of a named site, of a wanted length and camera.
 
     Raises UsageError.
     """
-    if name not in specification.SITES:
-        raise UsageError(f"there is no site '{name}': known are {', '.join(specification.SITES)}")
-    spec = specification.SITES[name]()
+    if site not in specification.SITES:
+        raise UsageError(f"there is no site '{site}': known are {', '.join(specification.SITES)}")
+    spec = specification.SITES[site]()
     if size not in SIZES:
         raise UsageError(f"size '{size}' is not known: choose {' or '.join(SIZES)}")
     if spec.size_free and size != "640":
@@ -38,13 +38,13 @@ def site(name: str = "trench", minutes: float | None = None, size: str = "640") 
         if not 0.3 <= minutes <= 600:
             raise UsageError(f"the length must lie between 0.3 and 600 minutes, found {minutes:g}")
         cycles = max(1, math.ceil((60 * minutes - 12) / (CYCLE_S * 1.015 + TRAM_S)))
-        spec = replace(spec, cycles=cycles)
+        spec = specification.lengthened(spec, cycles)
     return spec
 
 
 def make(
     folder: Path | None = None,
-    site_name: str = "trench",
+    site: str = "trench",
     minutes: float | None = None,
     size: str = "640",
     seed: int = SAMPLE_SEED,
@@ -57,7 +57,7 @@ def make(
     ----------
     folder
         Left out: ``sample_logs/trench`` for the committed sample, else ``sample_logs/generated/<name>``.
-    site_name
+    site
         ``trench`` or ``other``.
     minutes
         At least this long, in whole cycles; left out, the site's own four cycles.
@@ -74,11 +74,11 @@ def make(
     ------
     UsageError
     """
-    spec = site(site_name, minutes, size)
-    if (site_name, minutes, size, seed) != ("trench", None, "640", SAMPLE_SEED):
+    spec = specification_of(site, minutes, size)
+    if (site, minutes, size, seed) != ("trench", None, "640", SAMPLE_SEED):
         length = "" if minutes is None else f"-{minutes:g}min"
         pixels = f"-{size}" if spec.size_free else ""
-        spec = replace(spec, name=f"{site_name}{pixels}{length}-{seed}")
+        spec = replace(spec, name=f"{site}{pixels}{length}-{seed}")
         default = DRAWN / spec.name
     else:
         default = FOLDER / spec.name

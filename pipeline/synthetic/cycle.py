@@ -2,8 +2,8 @@
 
 Everything is a function of time with continuous accelerations, so that the truth exists at any instant. The
 operator steers the middle of the cutting edge; while it cuts, it follows a floor that is a function of the
-station, and the machine's rocking is steered against as a good operator does, so that the floor says what the
-plan says.
+station. The machine shakes on its tracks meanwhile, faster than five frames a second can follow: that is what
+limits a real recording between its frames, and what the motion prior of machine.toml has to admit.
 """
 
 from __future__ import annotations
@@ -21,6 +21,9 @@ CYCLE_S = 14.2
 TRAM_S = 2.4
 IDLE_S = 3.0
 CONTROL_S = 11.5
+SHAKE_HZ = (0.7, 4.0)
+SOIL_HOLDS = 0.5
+IDLE_LEVEL = 0.1  # of the shaking while cutting: the engine alone
 PHASES = ("dig", "swing", "dump", "return", "tram", "idle", "control")
 
 # One cycle, seconds from its beginning: reach from the far end of the sweep, height of the edge above the floor
@@ -60,11 +63,12 @@ class Motion:
         self._build(rng)
         self._curves = {key: _smooth(knots) for key, knots in self._plan.items()}
         self._floor = _floor_deviation(spec)
-        # Rocking: a few slow oscillations of the undercarriage on its tracks, in phase with nothing.
-        self._rock = rng.uniform(0.0, 2 * np.pi, (6, 3))
-        self._rock_hz = rng.uniform(0.45, 1.9, (6, 3))
+        # Shaking of the machine on its tracks while it cuts: many oscillations in phase with nothing.
+        low, high = np.log(SHAKE_HZ)
+        self._shake_hz = np.exp(rng.uniform(low, high, (6, 12)))
+        self._shake_phase = rng.uniform(0.0, 2 * np.pi, (6, 12))
         self._pass_extra = rng.uniform(15.0, 35.0, len(self.sweeps)) / 1000.0
-        self._ground = rng.uniform(0.0, 2 * np.pi, (3, 2))
+        self._ground = rng.uniform(0.0, 2 * np.pi, (1, 2))
 
     def _build(self, rng: np.random.Generator) -> None:
         spec = self.spec
@@ -149,20 +153,20 @@ class Motion:
         """Poses of all bodies at times (n,), seconds."""
         t = np.asarray(t, float)
         spec = self.spec
-        T_world_cab = self._cab(t)
+        T_world_steady, shake = self._cab(t)
         heading = self.place.bearing_rad + np.pi + self._curves["swing"](t)
         reach, height = self._curves["reach"](t), self._curves["height"](t)
-        axis = self.place.point(self._curves["stand"](t), 0.0, spec.ground)
-        tip = axis.copy()
+        tip = self.place.point(self._curves["stand"](t), 0.0, spec.ground)
         tip[:, 0] += reach * np.cos(heading)
         tip[:, 1] += reach * np.sin(heading)
         station, _ = self.place.station_offset(tip)
         tip[:, 2] = self.floor(station) + self._extra(t, station) + height
-        # The wanted point in the frame of the rocking cab; what it is off the plane of the arm stays off.
-        tip_cab = se3.transform(se3.inverse(T_world_cab), tip)
+        # The soil holds the teeth, so the arm gives way to part of the shaking; the rest reaches the edge.
+        T_world_felt = se3.retract(T_world_steady, SOIL_HOLDS * shake)
+        tip_cab = se3.transform(se3.inverse(T_world_felt), tip)
         bucket = np.deg2rad(self._curves["bucket"](t))
         boom, stick = joint_directions(spec.arm, tip_cab[:, [0, 2]], bucket)
-        return Poses(t, T_world_cab, boom, stick, bucket)
+        return Poses(t, se3.retract(T_world_steady, shake), boom, stick, bucket)
 
     def _extra(self, t: np.ndarray, station: np.ndarray) -> np.ndarray:
         """What a pass leaves for the next one to take: higher where the next pass will come again, and ripples."""
@@ -173,28 +177,28 @@ class Motion:
             extra = extra + window * again * self._pass_extra[k]
         return extra
 
-    def _cab(self, t: np.ndarray) -> np.ndarray:
+    def _cab(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """``T_world_cab`` without shaking, (n, 4, 4), and the shaking as ``xi`` of the cab, (n, 6)."""
         spec = self.spec
         swing = self._curves["swing"](t)
         stand = self._curves["stand"](t)
-        # Uneven ground under the tracks, and rocking while the bucket cuts.
+        # The ground under the tracks is not even.
         lean = 0.004 * np.sin(2 * np.pi * stand / np.array([[4.1], [6.7]]) + self._ground[0][:, None])
-        digging = np.zeros_like(t)
-        for sweep in self.sweeps:
-            s = t - sweep.start_s
-            digging = digging + _blend((s - 0.6) / 0.8) * (1 - _blend((s - 5.2) / 1.6))
-        level = 0.12 + digging
-        waves = np.sin(2 * np.pi * self._rock_hz[..., None] * t + self._rock[..., None]).sum(axis=1) / 3
-        amplitude = np.array([0.0015, 0.001, 0.0012, 0.0007, 0.0012, 0.0002])[:, None]  # m, rad
-        xi = (amplitude * waves * level).T
         track = self.place.bearing_rad + np.pi
         position = self.place.point(stand, 0.003 * np.sin(stand), spec.ground - 0.02 + 0.004 * np.sin(stand))
         R_track = so3.from_rpy_deg(np.array([0.0, 0.0, np.rad2deg(track)])) @ so3.exp(
             np.stack([lean[0], lean[1], 0 * t], axis=-1)
         )
-        T_world_track = se3.retract(se3.from_rotation_translation(R_track, position), xi)
         turn = so3.exp(np.stack([0 * t, 0 * t, swing], axis=-1))
-        return T_world_track @ se3.from_rotation_translation(turn, np.zeros(3))
+        T_world_steady = se3.from_rotation_translation(R_track @ turn, position)
+        level = np.full_like(t, IDLE_LEVEL)
+        for sweep in self.sweeps:
+            s = t - sweep.start_s
+            level = level + (1 - IDLE_LEVEL) * _blend((s - 0.6) / 0.8) * (1 - _blend((s - 5.2) / 1.6))
+        waves = np.sin(2 * np.pi * self._shake_hz[..., None] * t + self._shake_phase[..., None]).sum(axis=1)
+        waves *= np.sqrt(2 / self._shake_hz.shape[1])
+        rms = np.array([*spec.shake_m, *spec.shake_rad])[:, None]
+        return T_world_steady, (rms * waves * level).T
 
 
 @dataclass(frozen=True)

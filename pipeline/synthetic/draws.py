@@ -38,7 +38,7 @@ def uncertainty(spec: Specification) -> Uncertainty:
 
     # A lens is calibrated to the same angles whatever the number of pixels.
     scale = spec.focal / 850.0
-    focal = s.focal_px * scale
+    focal, centre = s.focal_px * scale, s.centre_px * scale
     curves = {}
     for sensor in spec.sensors:
         if sensor.kind == "potentiometer":
@@ -49,7 +49,7 @@ def uncertainty(spec: Specification) -> Uncertainty:
             curves[sensor.name] = np.array([200 * s.curve_zero, 1e-5])
     return Uncertainty(
         camera=pose(s.camera_mm, s.camera_deg),
-        intrinsics=np.array([focal, focal, s.centre_px, s.centre_px, *s.distortion]),
+        intrinsics=np.array([focal, focal, centre, centre, *s.distortion]),
         benchmark=pose(s.benchmark_mm, s.benchmark_deg),
         stick_marker=pose(s.marker_mm, s.marker_deg),
         axis=pose(s.axis_mm, s.axis_deg),

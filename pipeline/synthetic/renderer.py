@@ -8,6 +8,7 @@ top-left pixel is (0, 0).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -56,6 +57,9 @@ class Renderer:
         plans = [b.board for b in spec.benchmarks] + [spec.stick_board]
         self.boards: dict[str, Board] = {p.name: board(p, spec.family) for p in plans}
         self.textures = {name: scenery.board_texture(b, rng) for name, b in self.boards.items()}
+        side = 512 + max(spec.width, spec.height) + 8
+        mud = scenery.cloudy((side, side), 190, rng, 6)
+        self.dirt = np.clip(1 + 0.07 * mud, 0.7, 1.25).astype(np.float32)
         self.noise = [
             rng.normal(size=(spec.height + 64, spec.width + 64)).astype(np.float32) for _ in range(3)
         ]
@@ -189,21 +193,24 @@ class Renderer:
         z = self.motion.floor(np.array([first, near]))
         g, wide = spec.ground, w + 0.12
 
-        def quad(*corners: tuple[float, float, float]) -> np.ndarray:
-            return np.array([place.point(*c) for c in corners])
+        def quad(*corners: Sequence[float] | np.ndarray) -> np.ndarray:
+            return np.array([place.point(c[0], c[1], c[2]) for c in corners])
 
-        heap_side = 1.0 if spec.swing_deg < 0 else -1.0
         view.fill(canvas, quad((first, wide, g), (near, wide, g), (near, w, z[1]), (first, w, z[0])), 66)
         view.fill(canvas, quad((first, -wide, g), (near, -wide, g), (near, -w, z[1]), (first, -w, z[0])), 88)
         view.fill(canvas, quad((first, w, z[0]), (near, w, z[1]), (near, -w, z[1]), (first, -w, z[0])), 76)
         view.fill(canvas, quad((first, wide, g), (first, -wide, g), (first, -w, z[0]), (first, w, z[0])), 82)
-        o = heap_side * 3.2
-        for shift, tone in ((0.0, 101), (0.35, 109), (-0.3, 95)):
-            ridge = [
-                (first + 1 + i * 1.1, o + 0.25 * np.sin(3.1 * i + shift), g + 0.9 + 0.25 * np.sin(1.7 * i))
-                for i in range(9)
+        # The heap: slices one behind the other, each a lumpy profile, lit from the crest downwards.
+        along_it = np.linspace(first, near + 1.0, 40)
+        k = np.array([[1.0], [2.0], [3.0], [5.0]])
+        lumps = np.sum(np.sin(1.9 * k * along_it + k * self.phase[0]) / k, axis=0)
+        for across, tall, tone in ((4.0, 0.75, 92), (3.5, 0.95, 104), (2.9, 0.6, 113), (2.4, 0.3, 106)):
+            crest = np.maximum(tall + 0.13 * lumps + 0.03 * np.sin(7 * along_it + across), 0.05)
+            crest = crest * np.clip((near + 1.0 - along_it) / 1.5, 0, 1)
+            ridge = np.stack([along_it, np.full_like(crest, -across), g + crest], axis=-1)
+            foot = np.stack([along_it, np.full_like(crest, 0.5 - across), np.full_like(crest, g)], axis=-1)[
+                ::-1
             ]
-            foot = [(first + 1 + i * 1.1, o - heap_side * (1.3 + shift), g) for i in range(9)][::-1]
             view.fill(canvas, quad(*ridge, *foot), tone)
 
     def _posts(self, view: View, canvas: np.ndarray) -> None:
@@ -212,9 +219,9 @@ class Renderer:
             b = self.boards[plan.board.name]
             for side in (-0.3, 0.3):
                 top = se3.transform(T, np.array([side * b.size[0], 0.4 * b.size[1], -0.03]))
-                across = T[:3, 0] * 0.035
+                across = T[:3, 0] * 0.045
                 foot = np.array([top[0], top[1], self.spec.ground])
-                view.fill(canvas, np.array([top - across, top + across, foot + across, foot - across]), 118)
+                view.fill(canvas, np.array([top - across, top + across, foot + across, foot - across]), 58)
 
     def _bracket(self, view: View, scene: np.ndarray, T_world_stick: np.ndarray) -> None:
         T = T_world_stick @ self.mounts.stick_marker
@@ -332,6 +339,7 @@ class View:
         self.eye = se3.inverse(T_camera_world)[:3, 3]
         self.intrinsics = renderer.mounts.intrinsics[camera]
         self.size = (renderer.spec.width, renderer.spec.height)
+        self.dirt = renderer.dirt
 
     def outline(self, p_world: np.ndarray) -> np.ndarray | None:
         """Pixels of a face's outline with what is behind the camera cut away; None if nothing is left."""
@@ -379,7 +387,11 @@ class View:
         blend = mask.astype(np.float32) / 255
         patch = scene[y0:y1, x0:x1]
         patch *= 1 - blend
-        patch += blend * np.float32(tone)
+        # Mud and glare: a face is never of one tone. The pattern slides with the face's first corner.
+        rows, columns = mask.shape
+        x, y = (int(v) % 512 for v in uv[0])
+        dirt = self.dirt[y : y + rows, x : x + columns]
+        patch += blend * (dirt * np.float32(tone))
 
     def _box(self, uv: np.ndarray) -> tuple[int, int, int, int]:
         x0, y0 = np.maximum(np.floor(uv.min(0)).astype(int) - 1, 0)

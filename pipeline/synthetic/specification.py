@@ -7,6 +7,7 @@ runs along the alignment, an *offset* is positive to its left. The machine faces
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
 
 
@@ -23,9 +24,9 @@ class CameraPlan:
     pitch_deg: float
     """Positive looks up."""
     roll_deg: float = 0.0
-    distortion: tuple[float, float, float, float, float] = (-0.14, 0.05, 0.0003, -0.0002, 0.0)
+    distortion: tuple[float, float, float, float, float] = (-0.022, 0.008, 0.0003, -0.0002, 0.0)
     stamp_delay_ms: float = 0.0
-    """The cameras do not fire at the same instant."""
+    """Against the first camera: they run freely and do not fire at the same instant."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +56,8 @@ class BenchmarkPlan:
     """Turned away from facing the alignment squarely, about the vertical."""
     lean_deg: float = 0.0
     """Leaning back."""
+    roll_deg: float = 0.0
+    """Hung askew, counter-clockwise for who looks at it. Edges along the rows of pixels all err alike."""
 
 
 @dataclass(frozen=True)
@@ -81,24 +84,24 @@ class SensorPlan:
 class Sigmas:
     """Standard deviations that the files state, and from which their errors are drawn."""
 
-    camera_mm: float = 2.0
-    camera_deg: float = 0.02
+    camera_mm: float = 1.0
+    camera_deg: float = 0.01
     focal_px: float = 0.5
-    centre_px: float = 0.7
+    centre_px: float = 0.25
     distortion: tuple[float, float, float, float, float] = (0.002, 0.006, 0.0001, 0.0001, 0.0)
-    benchmark_mm: float = 2.0
-    benchmark_deg: float = 0.05
-    marker_mm: float = 1.5
-    marker_deg: float = 0.03
-    axis_mm: float = 1.0
+    benchmark_mm: float = 1.0
+    benchmark_deg: float = 0.02
+    marker_mm: float = 0.8
+    marker_deg: float = 0.015
+    axis_mm: float = 0.6
     axis_deg: float = 0.03
-    linkage_mm: float = 0.3
-    horn_deg: float = 0.04
+    linkage_mm: float = 0.25
+    horn_deg: float = 0.03
     curve_zero: float = 0.0003
     """Metres of cylinder, or degrees for a sensor of angle (times 200)."""
     curve_scale: float = 0.00015
     """Metres per volt; for a sensor of angle relative."""
-    tool_mm: float = 1.5
+    tool_mm: float = 1.0
     tool_deg: float = 0.1
     shot_mm: float = 2.0
 
@@ -178,6 +181,10 @@ class Specification:
     """Where the first sweep begins to cut."""
     axis_reach: float = 6.75
     """Distance of that point from the swing axis."""
+    shake_m: tuple[float, float, float] = (0.0022, 0.0015, 0.0022)
+    """Shaking of the cab while it cuts, standard deviation along its axes, metres."""
+    shake_rad: tuple[float, float, float] = (0.0009, 0.0013, 0.0005)
+    """About its axes, radians."""
     start_utc_ns: int = 1_750_000_000_000_000_000
     arm: Arm = Arm()
     sigmas: Sigmas = Sigmas()
@@ -188,8 +195,11 @@ class Specification:
     blur_px: float = 0.6
     jpeg_quality: int = 75
     sensor_note: str = ""
-    motion: dict[str, tuple[float, float]] = field(default_factory=dict)
-    """Spectral densities of white-noise acceleration by body, for machine.toml."""
+    motion: dict[str, tuple[float, float]] = field(
+        default_factory=lambda: {"cab": (0.045, 0.01), "stick": (0.12, 0.01), "bucket": (0.12, 1.0)}
+    )
+    """Spectral densities of white-noise acceleration by body, for machine.toml; measured on the motion itself: what
+    interpolation between frames misses while digging."""
     size_free: bool = True
     """Whether its cameras may be had with other numbers of pixels."""
 
@@ -225,14 +235,14 @@ def trench() -> Specification:
                 (0.70, 0.95, 2.30),
                 -4.0,
                 -5.5,
-                distortion=(-0.17, 0.06, -0.0002, 0.0003, 0.0),
-                stamp_delay_ms=7.3,
+                distortion=(-0.03, 0.012, -0.0002, 0.0003, 0.0),
+                stamp_delay_ms=63.0,
             ),
         ),
         benchmarks=(
-            BenchmarkPlan(BoardPlan("bm-near", 10, 2, 2, 0.34, 0.07), 0.1, 6.2, 1.05, 12.0, 6.0),
-            BenchmarkPlan(BoardPlan("bm-west", 20, 2, 2, 0.45, 0.08), -1.75, 9.4, 3.4, -18.0, 0.0),
-            BenchmarkPlan(BoardPlan("bm-east", 30, 2, 2, 0.45, 0.08), 1.75, 9.9, 1.9, 14.0, 2.0),
+            BenchmarkPlan(BoardPlan("bm-near", 10, 2, 2, 0.34, 0.07), 0.1, 6.2, 1.05, 12.0, 6.0, 7.0),
+            BenchmarkPlan(BoardPlan("bm-west", 20, 2, 2, 0.45, 0.08), -1.75, 9.4, 3.4, -18.0, 0.0, -6.0),
+            BenchmarkPlan(BoardPlan("bm-east", 30, 2, 2, 0.45, 0.08), 1.75, 9.9, 1.9, 14.0, 2.0, 5.0),
         ),
         stick_board=BoardPlan("stick-board", 1, 2, 2, 0.26, 0.06, 0.04),
         stick_marker=(0.75, 0.05, -0.55),
@@ -241,6 +251,48 @@ def trench() -> Specification:
         sensors=(
             SensorPlan("bucket-pot", "/bucket/potentiometer", "potentiometer", "sensor_sample", "protobuf"),
         ),
+    )
+
+
+BLOCK_CYCLES = 4
+"""As many cycles as one group of benchmarks stays in view for."""
+GROUP_IDS = 30
+MAX_GROUPS = 18
+
+
+def lengthened(spec: Specification, cycles: int) -> Specification:
+    """The same site worked on for longer: more trench, and a group of benchmarks for every few metres of it.
+
+    What is dug off the design repeats. Once the tags' ids run out, the machine moves on more slowly.
+    """
+    if cycles <= BLOCK_CYCLES:
+        return replace(spec, cycles=cycles)
+    travel = min(cycles, BLOCK_CYCLES * MAX_GROUPS) * spec.step_m
+    step = travel / cycles
+    block = BLOCK_CYCLES * spec.step_m
+    middle = 0.5 * (cycles - 1) * step
+    benchmarks = []
+    for group in range(math.ceil(travel / block - 1e-9)):
+        here = 0.5 * (BLOCK_CYCLES - 1) * spec.step_m + group * block - middle
+        for plan in spec.benchmarks:
+            first_id = plan.board.first_id + group * GROUP_IDS
+            board = replace(plan.board, name=f"{plan.board.name}-{group + 1}", first_id=first_id)
+            benchmarks.append(replace(plan, board=board, station=plan.station + here))
+    period = 6.0
+    repeats = range(math.ceil(travel / period) + 1)
+    dug = tuple((a + k * period, b + k * period, mm) for k in repeats for a, b, mm in spec.trench.dug)
+    length = max(spec.length_m, travel + 24.0)
+    rows = spec.trench.rows
+    slope = (rows[-1][1] - rows[-2][1]) / (rows[-1][0] - rows[-2][0])
+    if (end := spec.start_station + length) > rows[-1][0]:
+        rows = (*rows, (end, rows[-1][1] + slope * (end - rows[-1][0])))
+    return replace(
+        spec,
+        cycles=cycles,
+        step_m=step,
+        benchmarks=tuple(benchmarks),
+        trench=replace(spec.trench, rows=rows, dug=dug),
+        length_m=length,
     )
 
 

@@ -14,6 +14,7 @@ from pipeline.synthetic.specification import Specification
 
 POINTS = ("left", "middle", "right")
 SWEEP_HZ = 1000
+RAMP_M = 0.12  # above the floor that was wanted, the edge is on its way in or out and has not dug it
 
 
 @dataclass(frozen=True)
@@ -49,11 +50,9 @@ def dug_floor(
     """
     place = motion.place
     end = motion.duration_s if before_s is None else before_s
-    first = np.floor((spec.first_station - 1.0 - spec.start_station) / cell_m)
-    last = np.ceil(
-        (spec.first_station + spec.cycles * spec.step_m + spec.sweep_m + 1 - spec.start_station) / cell_m
-    )
-    station = spec.start_station + (np.arange(first, last) + 0.5) * cell_m
+    first = np.floor((spec.first_station - 1.0) / cell_m + 1e-6)
+    last = np.ceil((spec.first_station + spec.cycles * spec.step_m + spec.sweep_m + 1.0) / cell_m)
+    station = (np.arange(first, last) + 0.5) * cell_m
     across = round(spec.arm.width_m / cell_m)
     offset = (np.arange(across) - 0.5 * (across - 1)) * cell_m
     z = np.full((len(station), across), np.nan)
@@ -69,7 +68,7 @@ def dug_floor(
             f = (wanted - o[:, 0]) / (o[:, 1] - o[:, 0])
             along = s[:, 0] + f * (s[:, 1] - s[:, 0])
             level = height[:, 0] + f * (height[:, 1] - height[:, 0])
-            good = (f >= 0) & (f <= 1) & (level < spec.ground - 0.2)
+            good = (f >= 0) & (f <= 1) & (level < motion.floor(along) + RAMP_M)
             cell = (along - station[0]) / cell_m
             step = np.flatnonzero(good[:-1] & good[1:] & (np.floor(cell[:-1]) != np.floor(cell[1:])))
             row = np.maximum(np.floor(cell[step]), np.floor(cell[step + 1])).astype(int)
@@ -86,7 +85,7 @@ def dug_floor(
 def station_truth(spec: Specification, floor: Floor, step_m: float) -> dict[str, np.ndarray]:
     """Mean true floor of each station: columns of truth/stations.parquet, grid metres.
 
-    A station covers ``[station, station + step)`` measured along the alignment in whole steps.
+    A station is the middle of a piece of the alignment one step long, from a whole multiple of the step.
     """
     from pipeline.synthetic.files import METRES_PER_UNIT
 
@@ -96,7 +95,7 @@ def station_truth(spec: Specification, floor: Floor, step_m: float) -> dict[str,
     for i in np.unique(index):
         cells = floor.z[index == i]
         cut = np.isfinite(cells)
-        rows["station"].append(i * step_m)
+        rows["station"].append(round((i + 0.5) * step_m, 6))
         rows["h"].append(float(cells[cut].mean() + height) if cut.any() else np.nan)
         rows["state"].append("cut" if cut.all() else "partly cut" if cut.any() else "not reached")
         rows["cells_cut"].append(int(cut.sum()))
