@@ -15,54 +15,34 @@ import io
 import struct
 import zlib
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame
-import zstandard
 from mcap import records
 from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from pipeline.errors import LogError
+from pipeline.logs.chunks import (
+    CHUNK,
+    HEADER,
+    MAX_CHUNK_BYTES,
+    MESSAGE,
+    UNREADABLE,
+    Damaged,
+    Span,
+    load_span,
+    records_of,
+)
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES = 512 << 20
-"""No recorder writes chunks near this; memory stays under it whatever a file promises."""
 MAX_SUMMARY_BYTES = 512 << 20
 PLAIN_SPAN_BYTES = 4 << 20
 """Messages outside chunks are taken together to about this size."""
 
-_HEADER = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQI")
 _FOOTER = struct.Struct("<QQI")
-_FOOTER_BYTES = _HEADER.size + _FOOTER.size + len(MAGIC)
-_UNREADABLE = (McapError, struct.error, ValueError, EOFError, RuntimeError, zstandard.ZstdError)
-
-
-class Damaged(Exception):
-    """These bytes are not what an MCAP file promises."""
-
-
-@dataclass(frozen=True)
-class Span:
-    """A chunk, or a run of messages outside chunks."""
-
-    offset: int
-    """Of its first record in the file."""
-    length: int
-    """Bytes in the file, record header included."""
-    start_ns: int
-    """Earliest log_time in it."""
-    end_ns: int
-    """Latest log_time in it."""
-    chunked: bool
-    channels: frozenset[int] | None
-    """Ids of the channels in it; None where the file does not say."""
+_FOOTER_BYTES = HEADER.size + _FOOTER.size + len(MAGIC)
 
 
 @dataclass(frozen=True)
@@ -125,38 +105,9 @@ def read_contents(path: Path) -> Contents:
         _check_magic(path, file.read(64))
         try:
             contents = _from_summary(path, file, size)
-        except (Damaged, *_UNREADABLE):
+        except (Damaged, *UNREADABLE):
             contents = None
         return contents or _by_walking(path, file, size)
-
-
-def load_span(file: BinaryIO, span: Span) -> memoryview:
-    """The records of a span, decompressed and held against their CRC. Raises Damaged."""
-    file.seek(span.offset)
-    if not span.chunked:
-        data = file.read(span.length)
-        if len(data) != span.length:
-            raise Damaged("the file ends inside a run of messages")
-        return memoryview(data)
-    if span.length > MAX_CHUNK_BYTES + 1024:
-        raise Damaged(f"a chunk of {span.length} bytes")
-    data = file.read(span.length)
-    if len(data) != span.length or _HEADER.unpack_from(data)[0] != Opcode.CHUNK:
-        raise Damaged("no chunk where one should be")
-    if _HEADER.unpack_from(data)[1] != span.length - _HEADER.size:
-        raise Damaged("a chunk of another length than the index says")
-    return _unpack_chunk(memoryview(data)[_HEADER.size :])
-
-
-def messages_of(data: memoryview, wanted: frozenset[int] | None) -> Iterator[tuple[int, int, memoryview]]:
-    """Channel id, log_time and payload of the messages among some records. Raises Damaged."""
-    for opcode, body in _records_of(data):
-        if opcode == Opcode.MESSAGE:
-            if len(body) < _MESSAGE.size:
-                raise Damaged("a message shorter than its header")
-            channel, _, log_time, _ = _MESSAGE.unpack_from(body)
-            if wanted is None or channel in wanted:
-                yield channel, log_time, body[_MESSAGE.size :]
 
 
 def _size_of(path: Path) -> int:
@@ -197,50 +148,6 @@ def _check_magic(path: Path, start: bytes) -> None:
     if not start.strip(b"\0"):
         raise LogError(f"{path}: begins with zeros, no MCAP log; the copy or the disk failed")
     raise LogError(f"{path}: is not an MCAP log (its first bytes are {start[:8].hex(' ')})")
-
-
-def _records_of(data: memoryview) -> Iterator[tuple[int, memoryview]]:
-    position, end = 0, len(data)
-    while position < end:
-        if end - position < _HEADER.size:
-            raise Damaged("a record header is cut")
-        opcode, length = _HEADER.unpack_from(data, position)
-        position += _HEADER.size
-        if length > end - position:
-            raise Damaged("a record is longer than what holds it")
-        yield opcode, data[position : position + length]
-        position += length
-
-
-def _unpack_chunk(body: memoryview) -> memoryview:
-    try:
-        _, _, size, crc = _CHUNK.unpack_from(body)
-        name_length = struct.unpack_from("<I", body, _CHUNK.size)[0]
-        at = _CHUNK.size + 4 + name_length
-        if name_length > 16 or size > MAX_CHUNK_BYTES:
-            raise Damaged(f"a chunk that promises {size} bytes")
-        compression = str(body[_CHUNK.size + 4 : at], "utf-8")
-        packed = body[at + 8 : at + 8 + struct.unpack_from("<Q", body, at)[0]]
-        data = _decompressed(packed, compression, size)
-    except _UNREADABLE as error:
-        raise Damaged(str(error)) from None
-    if len(data) != size:
-        raise Damaged(f"a chunk of {len(data)} bytes that promised {size}")
-    if crc and zlib.crc32(data) != crc:
-        raise Damaged("a chunk whose CRC does not agree")
-    return data
-
-
-def _decompressed(packed: memoryview, compression: str, size: int) -> memoryview:
-    if compression == "":
-        return packed
-    # One byte more than promised is asked for, so that a bomb is noticed and never unpacked.
-    if compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(io.BytesIO(packed)) as stream:
-            return memoryview(stream.read(size + 1))
-    if compression == "lz4":
-        return memoryview(lz4.frame.LZ4FrameDecompressor().decompress(bytes(packed), max_length=size + 1))
-    raise Damaged(f"compression '{compression}' is not one of zstd, lz4, none")
 
 
 @dataclass
@@ -299,7 +206,7 @@ def _from_summary(path: Path, file: BinaryIO, size: int) -> Contents | None:
         return None
     file.seek(size - _FOOTER_BYTES)
     tail = file.read(_FOOTER_BYTES)
-    start, _, crc = _FOOTER.unpack_from(tail, _HEADER.size)
+    start, _, crc = _FOOTER.unpack_from(tail, HEADER.size)
     length = size - _FOOTER_BYTES - start
     if tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC) or start == 0:
         return None
@@ -307,10 +214,10 @@ def _from_summary(path: Path, file: BinaryIO, size: int) -> Contents | None:
         raise Damaged("the footer points outside the file")
     file.seek(start)
     summary = memoryview(file.read(length))
-    if crc and zlib.crc32(tail[: _HEADER.size + 16], zlib.crc32(summary)) != crc:
+    if crc and zlib.crc32(tail[: HEADER.size + 16], zlib.crc32(summary)) != crc:
         raise Damaged("the CRC of the summary does not agree")
     statistics = None
-    for opcode, body in _records_of(summary):
+    for opcode, body in records_of(summary):
         draft.note(opcode, body)
         if opcode == Opcode.STATISTICS:
             statistics = records.Statistics.read(_stream(body))
@@ -347,7 +254,7 @@ def _indexed_span(index: records.ChunkIndex, size: int) -> Span:
 
 def _read_header(file: BinaryIO, draft: _Draft) -> None:
     file.seek(len(MAGIC))
-    opcode, length = _HEADER.unpack(file.read(_HEADER.size))
+    opcode, length = HEADER.unpack(file.read(HEADER.size))
     if opcode == Opcode.HEADER and length < 4096:
         header = records.Header.read(_stream(file.read(length)))
         draft.profile, draft.library = header.profile, header.library
@@ -356,19 +263,19 @@ def _read_header(file: BinaryIO, draft: _Draft) -> None:
 def _attachment_at(file: BinaryIO, offset: int, size: int) -> AttachmentEntry | None:
     """The attachment whose record begins at `offset`; its data is not read."""
     file.seek(offset)
-    head = file.read(_HEADER.size + 16 + 4096)
+    head = file.read(HEADER.size + 16 + 4096)
     try:
-        opcode, length = _HEADER.unpack_from(head)
+        opcode, length = HEADER.unpack_from(head)
         if opcode != Opcode.ATTACHMENT:
             return None
-        stream = _stream(head[_HEADER.size :])
+        stream = _stream(head[HEADER.size :])
         stream.read(16)
         name, media_type = stream.read_prefixed_string(), stream.read_prefixed_string()
         data_size = stream.read8()
-    except _UNREADABLE:
+    except UNREADABLE:
         return None
-    data_offset = offset + _HEADER.size + stream.count
-    if data_offset + data_size + 4 > min(size, offset + _HEADER.size + length):
+    data_offset = offset + HEADER.size + stream.count
+    if data_offset + data_size + 4 > min(size, offset + HEADER.size + length):
         return None
     return AttachmentEntry(name, media_type, data_offset, data_size)
 
@@ -379,17 +286,17 @@ def _by_walking(path: Path, file: BinaryIO, size: int) -> Contents:
     position = len(MAGIC)
     promised_end_ns: int | None = None
     ended = False
-    while not ended and size - position >= _HEADER.size:
+    while not ended and size - position >= HEADER.size:
         file.seek(position)
-        opcode, length = _HEADER.unpack(file.read(_HEADER.size))
-        end = position + _HEADER.size + length
+        opcode, length = HEADER.unpack(file.read(HEADER.size))
+        end = position + HEADER.size + length
         if opcode == 0 or end > size:
             if opcode == Opcode.CHUNK:
-                promised_end_ns = _announced_end(file.read(_CHUNK.size))
+                promised_end_ns = _announced_end(file.read(CHUNK.size))
             break
         try:
             _walk_record(file, draft, opcode, position, length, size)
-        except (Damaged, *_UNREADABLE):
+        except (Damaged, *UNREADABLE):
             if opcode in (Opcode.HEADER, Opcode.SCHEMA, Opcode.CHANNEL):
                 break
         ended = opcode == Opcode.DATA_END
@@ -410,11 +317,11 @@ def _walk_record(file: BinaryIO, draft: _Draft, opcode: int, position: int, leng
         if entry := _attachment_at(file, position, size):
             draft.attachments.append(entry)
     elif opcode == Opcode.CHUNK:
-        _walk_chunk(file, draft, position, _HEADER.size + length)
+        _walk_chunk(file, draft, position, HEADER.size + length)
     elif opcode == Opcode.MESSAGE:
-        channel, _, log_time, _ = _MESSAGE.unpack(file.read(_MESSAGE.size))
+        channel, _, log_time, _ = MESSAGE.unpack(file.read(MESSAGE.size))
         draft.counts[channel] += 1
-        here = Span(position, _HEADER.size + length, log_time, log_time, False, frozenset([channel]))
+        here = Span(position, HEADER.size + length, log_time, log_time, False, frozenset([channel]))
         last = draft.spans[-1] if draft.spans else None
         follows = last and not last.chunked and last.offset + last.length == position
         if last and last.channels and follows and last.length < PLAIN_SPAN_BYTES:
@@ -435,23 +342,23 @@ def _walk_record(file: BinaryIO, draft: _Draft, opcode: int, position: int, leng
 
 
 def _walk_chunk(file: BinaryIO, draft: _Draft, position: int, length: int) -> None:
-    start_ns, end_ns, _, _ = _CHUNK.unpack(file.read(_CHUNK.size))
+    start_ns, end_ns, _, _ = CHUNK.unpack(file.read(CHUNK.size))
     span = Span(position, length, start_ns, end_ns, True, None)
     # A damaged chunk stays in the list: it is counted when it is read.
     draft.spans.append(span)
     seen: Counter[int] = Counter()
-    for opcode, body in _records_of(load_span(file, span)):
+    for opcode, body in records_of(load_span(file, span)):
         draft.note(opcode, body)
         if opcode == Opcode.MESSAGE:
-            seen[_MESSAGE.unpack_from(body)[0]] += 1
+            seen[MESSAGE.unpack_from(body)[0]] += 1
     draft.counts.update(seen)
     draft.spans[-1] = replace(span, channels=frozenset(seen))
 
 
 def _announced_end(head: bytes) -> int | None:
-    if len(head) < _CHUNK.size:
+    if len(head) < CHUNK.size:
         return None
-    start_ns, end_ns, _, _ = _CHUNK.unpack(head)
+    start_ns, end_ns, _, _ = CHUNK.unpack(head)
     return end_ns if start_ns <= end_ns else None
 
 

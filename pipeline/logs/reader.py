@@ -18,7 +18,8 @@ from typing import BinaryIO
 from pipeline.errors import LogError
 from pipeline.logs.cdr import MalformedMessage
 from pipeline.logs.channels import CALIBRATION, IMAGE, SAMPLE, Channel
-from pipeline.logs.container import Contents, Damaged, Span, load_span, messages_of, read_contents
+from pipeline.logs.chunks import Damaged, Span, load_span, messages_of
+from pipeline.logs.container import Contents, read_contents
 from pipeline.logs.messages import (
     Calibration,
     calibration_decoder,

@@ -7,7 +7,8 @@ import pytest
 import zstandard
 
 from pipeline.errors import PipelineError
-from pipeline.logs.container import MAGIC, Damaged, Span, load_span
+from pipeline.logs.chunks import Damaged, Span, load_span
+from pipeline.logs.container import MAGIC
 from pipeline.logs.reader import read_log
 
 from .conftest import write
