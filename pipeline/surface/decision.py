@@ -118,16 +118,15 @@ def decide(deviation: float, uncertainty: float, band: ToleranceBand) -> tuple[s
 
 
 def stations_along(design: Design, start: float, end: float, step: float) -> np.ndarray:
-    """Middles of the pieces, each one step long from a whole multiple of it, into which the design is cut; metres.
+    """Whole multiples of the step, the round numbers of a stakeout list, that the design reaches; metres.
 
-    The middle, because there the mean over a piece equals the level of a floor with a gradient.
+    Each stands for the piece from half a step before it to half a step behind: there the mean over the piece
+    equals the level of a floor with a gradient.
     """
     first, last = design.station_range()
     first, last = max(first, start), min(last, end)
-    piece = np.arange(
-        np.floor(first / step + 1e-6), max(np.ceil(last / step - 1e-6), np.floor(first / step + 1e-6) + 1)
-    )
-    return (piece + 0.5) * step
+    number = np.arange(np.floor(first / step + 0.5 + 1e-6), np.ceil(last / step - 0.5 - 1e-6) + 1)
+    return number * step
 
 
 def judge(

@@ -110,7 +110,7 @@ class Motion:
         spec = self.spec
         place = self.place
         stand = self._plan["stand"][-1][1]
-        angle, reach = np.deg2rad(self.control_swing_deg), 5.9
+        angle, reach = np.deg2rad(spec.control_swing_deg), 5.9
         self.control_stop_s = (t + 3.4, t + 8.4)
         heading = self.place.bearing_rad + np.pi + angle
         axis = place.point(stand, 0.0, spec.ground)
@@ -131,8 +131,6 @@ class Motion:
         self.duration_s = t + CONTROL_S
         self._put(self.duration_s + 1, stand=(stand, 0), reach=(6.2, 0), height=(height + 0.8, 0), bucket=(-80.0, 0),
                   swing=(angle, 0))  # fmt: skip
-
-    control_swing_deg = 14.0
 
     def _put(self, t: float, **values: tuple[float, float]) -> None:
         for key, (value, slope) in values.items():

@@ -173,7 +173,7 @@ def true_mounts(spec: Specification, rng: np.random.Generator) -> Mounts:
     for plan in spec.benchmarks:
         middle = spec.first_station + spec.axis_reach + 0.5 * (spec.cycles - 1) * spec.step_m
         position = place.point(middle + plan.station, plan.offset, spec.ground + plan.height)
-        normal = place.direction(-90.0 + plan.turn_deg)
+        normal = place.direction(-90.0 * spec.side + plan.turn_deg)
         normal = normal + np.array([0, 0, np.tan(np.deg2rad(plan.lean_deg))])
         askew = so3.exp(np.array([0.0, 0.0, np.deg2rad(plan.roll_deg)]))
         T = _pose(facing(normal, np.array([0.0, 0, 1])) @ askew, position)

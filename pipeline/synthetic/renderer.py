@@ -207,10 +207,10 @@ class Renderer:
         for across, tall, tone in ((4.0, 0.75, 92), (3.5, 0.95, 104), (2.9, 0.6, 113), (2.4, 0.3, 106)):
             crest = np.maximum(tall + 0.13 * lumps + 0.03 * np.sin(7 * along_it + across), 0.05)
             crest = crest * np.clip((near + 1.0 - along_it) / 1.5, 0, 1)
-            ridge = np.stack([along_it, np.full_like(crest, -across), g + crest], axis=-1)
-            foot = np.stack([along_it, np.full_like(crest, 0.5 - across), np.full_like(crest, g)], axis=-1)[
-                ::-1
-            ]
+            ridge = np.stack([along_it, np.full_like(crest, -across * spec.side), g + crest], axis=-1)
+            foot = np.stack(
+                [along_it, np.full_like(crest, (0.5 - across) * spec.side), np.full_like(crest, g)], axis=-1
+            )[::-1]
             view.fill(canvas, quad(*ridge, *foot), tone)
 
     def _posts(self, view: View, canvas: np.ndarray) -> None:

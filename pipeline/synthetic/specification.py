@@ -177,6 +177,8 @@ class Specification:
     sweep_m: float = 2.9
     """Length of one sweep of the edge along the floor."""
     swing_deg: float = 58.0
+    control_swing_deg: float = 14.0
+    """Where the control point lies; the benchmarks must still be in view."""
     first_station: float = 106.0
     """Where the first sweep begins to cut."""
     axis_reach: float = 6.75
@@ -202,6 +204,11 @@ class Specification:
     interpolation between frames misses while digging."""
     size_free: bool = True
     """Whether its cameras may be had with other numbers of pixels."""
+
+    @property
+    def side(self) -> float:
+        """1 if the benchmarks stand to the left of the alignment (right of the machine), -1 if to its right."""
+        return 1.0 if self.benchmarks[0].offset > 0 else -1.0
 
     def scaled(self, width: int, height: int, focal: float) -> Specification:
         """The same site seen by cameras of another size."""
@@ -296,4 +303,89 @@ def lengthened(spec: Specification, cycles: int) -> Specification:
     )
 
 
-SITES = {"trench": trench}
+def other() -> Specification:
+    """Another machine on another job, described by its two files alone: nothing in it is as on the first site.
+
+    Other names, 800x600 pixels, tag25h9, a benchmark more, no potentiometer but two angle sensors (JointStates in
+    JSON and an encoder card in the house's own message), benchmarks to the left of the machine, US survey feet.
+    """
+    foot = 1200.0 / 3937.0
+    return Specification(
+        name="other",
+        title="Water main, section 7",
+        machine_id="hx-220",
+        unit="us_survey_foot",
+        origin=(512345, 4123456, 818),
+        grid_name="local grid, NAVD88",
+        start=(0.678 * foot, 0.789 * foot),
+        bearing_deg=-118.0,
+        start_station=1000.0 * foot,
+        length_m=24.0,
+        ground=2.40,
+        trench=Trench(
+            rows=((304.0, 1.020), (312.0, 1.050), (332.0, 1.200)),
+            side_slope=0.75,
+            dug=((0.8, 1.5, 45.0),),
+        ),
+        family="tag25h9",
+        cameras=(
+            CameraPlan("stick_cam", "/sensors/stick/compressed", (0.70, 0.95, 2.30), -4.0, -5.5),
+            CameraPlan(
+                "site_cam",
+                "/sensors/site/compressed",
+                (0.55, -0.80, 2.45),
+                91.0,
+                -3.0,
+                distortion=(-0.03, 0.01, -0.0001, 0.0004, 0.0),
+                stamp_delay_ms=88.0,
+            ),
+        ),
+        benchmarks=(
+            BenchmarkPlan(BoardPlan("BM1", 4, 2, 2, 0.34, 0.08), 0.3, -6.4, 1.0, -10.0, 5.0, -6.0),
+            BenchmarkPlan(BoardPlan("BM2", 8, 2, 2, 0.45, 0.10), 2.3, -9.6, 3.5, 15.0, 0.0, 5.0),
+            BenchmarkPlan(BoardPlan("BM3", 12, 2, 2, 0.45, 0.10), -2.2, -9.9, 2.2, -14.0, 2.0, -8.0),
+            BenchmarkPlan(BoardPlan("BM4", 16, 2, 2, 0.45, 0.10), 0.1, -11.0, 3.8, 4.0, 0.0, 7.0),
+        ),
+        stick_board=BoardPlan("boom_plate", 0, 2, 2, 0.25, 0.07, 0.05),
+        stick_marker=(0.75, 0.05, -0.55),
+        stick_marker_turn_deg=38.0,
+        stick_marker_tilt_deg=18.0,
+        sensors=(
+            SensorPlan(
+                "bucket-encoder",
+                "/joints",
+                "encoder",
+                "joint_states",
+                "json",
+                rate_hz=25.0,
+                noise=0.0008,
+                step=0.0002,
+                time_offset_s=0.008,
+            ),
+            SensorPlan(
+                "bucket-card",
+                "/bucket/card",
+                "card",
+                "sensor_sample",
+                "protobuf",
+                noise=0.9,
+                step=1.0,
+                time_offset_s=-0.015,
+            ),
+        ),
+        width=800,
+        height=600,
+        focal=1060.0,
+        cycles=1,
+        swing_deg=-52.0,
+        control_swing_deg=5.0,
+        first_station=310.2,
+        start_utc_ns=1_761_000_000_000_000_000,
+        arm=Arm(width_m=0.9),
+        tolerance_mm=(25.0, 25.0),
+        design_kind="landxml",
+        size_free=False,
+    )
+
+
+SITES = {"trench": trench, "other": other}

@@ -85,17 +85,17 @@ def dug_floor(
 def station_truth(spec: Specification, floor: Floor, step_m: float) -> dict[str, np.ndarray]:
     """Mean true floor of each station: columns of truth/stations.parquet, grid metres.
 
-    A station is the middle of a piece of the alignment one step long, from a whole multiple of the step.
+    A station is a whole multiple of the step and stands for the piece of the alignment half a step to either side.
     """
     from pipeline.synthetic.files import METRES_PER_UNIT
 
     height = spec.origin[2] * METRES_PER_UNIT[spec.unit]
-    index = np.floor(floor.station / step_m + 1e-9).astype(int)
+    index = np.floor(floor.station / step_m + 0.5 + 1e-9).astype(int)
     rows: dict[str, list] = {"station": [], "h": [], "state": [], "cells_cut": [], "cells_floor": []}
     for i in np.unique(index):
         cells = floor.z[index == i]
         cut = np.isfinite(cells)
-        rows["station"].append(round((i + 0.5) * step_m, 6))
+        rows["station"].append(round(i * step_m, 6))
         rows["h"].append(float(cells[cut].mean() + height) if cut.any() else np.nan)
         rows["state"].append("cut" if cut.all() else "partly cut" if cut.any() else "not reached")
         rows["cells_cut"].append(int(cut.sum()))

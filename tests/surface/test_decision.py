@@ -102,14 +102,14 @@ BAND = ToleranceBand(0.02, 0.02)
 
 
 def judged(trench, built, step=0.5, band=BAND):
-    station = stations_along(trench.design, 0.0, 10.0, step)
+    station = (np.arange(round(10.0 / step)) + 0.5) * step  # whole pieces, none cut short at an end
     return judge(built, trench.design, station, step, band)
 
 
-def test_stations_are_the_middles_of_whole_steps_over_the_design(trench):
-    assert stations_along(trench.design, -5.0, 2.0, 0.5).tolist() == [0.25, 0.75, 1.25, 1.75]
-    assert stations_along(trench.design, 1.2, 2.0, 0.5).tolist() == [1.25, 1.75]
-    assert len(stations_along(trench.design, 0.0, 10.0, 0.1)) == 100
+def test_stations_are_the_whole_multiples_of_the_step_that_the_design_reaches(trench):
+    assert stations_along(trench.design, -5.0, 2.0, 0.5).tolist() == [0.0, 0.5, 1.0, 1.5, 2.0]
+    assert stations_along(trench.design, 1.2, 2.0, 0.5).tolist() == [1.0, 1.5, 2.0]
+    assert len(stations_along(trench.design, 0.0, 10.0, 0.1)) == 101
 
 
 def test_a_station_is_the_mean_of_its_cells(trench):

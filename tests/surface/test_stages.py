@@ -134,16 +134,16 @@ def test_a_trench_at_its_level_passes_and_every_file_is_written(folder):
     assert watch.warnings == []
     assert tracked == {"poses": 240, "epochs of the cutting edge": 120, "of these bridged": 0}
     assert facts["verdict"] == "PASS" and "within tolerance" in facts["reason"]
-    assert facts["counts"] == {"PASS": 6, "FAIL": 0, "CANNOT TELL": 0, "NOT REACHED": 4}
-    assert surveyed["stations"] == {"PASS": 6, "NOT REACHED": 4}
+    assert facts["counts"] == {"PASS": 7, "FAIL": 0, "CANNOT TELL": 0, "NOT REACHED": 4}
+    assert surveyed["stations"] == {"PASS": 7, "NOT REACHED": 4}
     assert facts["checks"]["n"] == 4 and facts["checks"]["bias"] == pytest.approx(-0.001, abs=1e-4)
     stations = tables.read_table(job.folder.file("stations.parquet"), "stations")
-    assert stations["station"].tolist() == [i + 0.5 for i in range(10)]
-    assert np.allclose(stations["deviation"][2:8], 0.0, atol=1e-4)
-    assert np.isnan(stations["deviation"][[0, 1, 8, 9]]).all()
+    assert stations["station"].tolist() == [float(i) for i in range(11)]
+    assert np.allclose(stations["deviation"][2:9], 0.0, atol=1e-4)
+    assert np.isnan(stations["deviation"][[0, 1, 9, 10]]).all()
     # Two passes at one level: the own part is that of two looks, the common part is whole.
-    assert np.allclose(stations["sigma_common"][2:8], 0.003)
-    assert np.all(stations["sigma_own"][2:8] < 0.004)
+    assert np.allclose(stations["sigma_common"][2:9], 0.003)
+    assert np.all(stations["sigma_own"][2:9] < 0.004)
     cells = tables.read_table(job.folder.file("as_built.parquet"), "as_built")
     assert set(cells["state"]) == {"cut", "never touched"}
     checks = tables.read_table(job.folder.file("checks.parquet"), "checks")
@@ -163,7 +163,7 @@ def test_an_over_dug_trench_fails_and_says_which_way(folder):
 def test_a_trench_not_yet_dug_is_not_reached_and_not_failed(folder):
     _, watch, _, _, facts = run_both(folder, level=51.2)
     assert facts["verdict"] == "CANNOT TELL"
-    assert facts["counts"]["NOT REACHED"] == 10
+    assert facts["counts"]["NOT REACHED"] == 11
     assert any("came no lower than 1.20 (m) above the design" in sentence for sentence in watch.warnings)
     assert facts["deviation"]["mean"] is None and facts["checks"]["n"] == 0
 
