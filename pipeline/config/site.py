@@ -154,8 +154,9 @@ class EstimationSettings(Section):
     huber: Positive = 2.5
     """Corner residual, in its own sigmas, beyond which its weight falls."""
     max_iterations: Annotated[int, Field(ge=1, le=200)] = 30
-    max_gap_s: Positive = 5.0
-    """States further than this from an observation of their body are marked `bridged`."""
+    max_gap_s: Positive = 0.5
+    """States further than this from an observation of their body are marked `bridged`: two frames missed at 5 Hz.
+    Half a second is as long as a swing or a dig is nearly uniform; later the motion prior alone speaks."""
 
 
 class SurveySettings(Section):

@@ -43,6 +43,7 @@ def adjust(
     readings : dict of str to Readings
         By name of the sensor; a sensor that is missing here was not recorded.
     settings : EstimationSettings, optional
+        Those of site.toml; without them the defaults.
 
     Returns
     -------
@@ -66,7 +67,7 @@ def adjust(
 def problem_of_log(network: Network, tied, epochs: Epochs) -> Problem:
     """The least-squares problem of a log, with its start."""
     first = start_values(network, tied, epochs)
-    statics = statics_of(network, first)
+    statics = statics_of(network, tied, first)
     return problem_of(network, tied, epochs, statics, Values(first.pose, first.rate, np.zeros(statics.size)))
 
 

@@ -1,4 +1,4 @@
-"""How well it fits: redundancy, sigma0 squared with its global test, the worst offenders, and what moved off its prior."""
+"""How well it fits: redundancy, sigma0 squared with its global test, and what moved off its prior."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def moved_statics(results: list[StaticResult]) -> list[str]:
             result.units[worst], f"{by:.4g} {result.units[worst]}".strip()
         )
         sentences.append(
-            f"{result.quantity} moved {abs(shift):.1f} sigma from its file value: {result.components[worst]} by {amount}; "
-            f"check that it was not knocked, or calibrate it again"
+            f"{result.quantity} moved {abs(shift):.1f} sigma from its file value: {result.components[worst]} "
+            f"by {amount}; check that it was not knocked, or calibrate it again"
         )
     return sentences

@@ -1,8 +1,9 @@
 """Eq. (3) of the paper with its own and its common part: covariances of every body at every epoch.
 
-``P_xx = H_xx^-1 + Y S^-1 Y'``: the first term is a state's own and averages out over epochs, the second comes through the
-statics and does not. A body in the world is a product of edges, some states, some statics; its error is the linear map
-``J_x dx + J_s dz`` of both, and ``dx = own - Y dz``. So its common part is ``M S^-1 M'`` with ``M = J_s - J_x Y``.
+``P_xx = H_xx^-1 + Y S^-1 Y'``: the first term is a state's own and averages out over epochs, the second comes
+through the statics and does not. A body in the world is a product of edges, some states, some statics; its error is
+the linear map ``J_x dx + J_s dz`` of both, and ``dx = own - Y dz``. So its common part is ``M S^-1 M'`` with
+``M = J_s - J_x Y``.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
             "this happens when a sigma in machine.toml or site.toml is wrong by orders of magnitude"
         ) from None
     Z = tuple(arrow.selected_inverse(f)[0] for f in step.factors)
-    return Marginals(Z, step.Y, tuple(c.columns for c in chains), 0.5 * (P_zz + P_zz.T))
+    return Marginals(Z, arrow.border(step), tuple(c.columns for c in chains), 0.5 * (P_zz + P_zz.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +87,13 @@ def body_track(problem: Problem, values: Values, found: Marginals, frame: str, n
         J_x = J_chain.setdefault(c, np.zeros((E, 6, problem.chain_size(c))))
         if step.edge.kind == "joint":
             J_x[:, :, at.start] += J[:, :, 5]
-            velocity += J[:, :, 5] * values.rate[index][:, None]
+            J_x[:, :, at.start + 1] -= J[:, :, 5] * problem.statics.clock_error(index, values.z)
+            turning = J[:, :, 5] * values.rate[index][:, None]
+            velocity += turning
+            clock = problem.statics.clocks[index]
+            if clock is not None:
+                sensitivity = problem.statics.sensitivity(clock, values.z)
+                M[:, :, problem.statics.columns[clock]] -= turning[..., None] @ sensitivity
         else:
             J_x[:, :, at.start : at.start + 6] += J
             velocity += np.einsum("nij,nj->ni", J, values.rate[index])
@@ -113,6 +120,7 @@ def vertical_budget(track: BodyTrack, P_zz, groups: dict[str, np.ndarray], rows)
     Parameters
     ----------
     track : BodyTrack
+        Of the body.
     P_zz : (p, p) array
         ``S^-1``.
     groups : dict of str to (r,) int array

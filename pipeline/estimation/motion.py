@@ -48,6 +48,9 @@ def pose_residual(T_1, w_1, T_2, w_2, dt_s, jacobians=True):
     w_1, w_2 : (n, 6) array
         Velocity in the body, translation first, m/s and rad/s.
     dt_s : (n,) array
+        Seconds between the two epochs.
+    jacobians : bool
+        Whether to compute them; else None comes back in their place.
 
     Returns
     -------
@@ -97,6 +100,7 @@ def whiten(blocks, W, root):
     Parameters
     ----------
     blocks : (n, 2h, ...) array
+        Unwhitened.
     W : (n, 2, 2) array
         Of ``whitening``.
     root : (h,) array

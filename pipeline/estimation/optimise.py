@@ -26,6 +26,9 @@ DAMPING_FIRST, DAMPING_UP, DAMPING_DOWN, DAMPING_NONE = 1e-3, 10.0, 0.1, 1e-7
 STEP_SIGMAS = 0.05
 """Converged when no unknown moves by more of its posterior sigma. ``-g' dx`` is the squared length of the whole step
 in that measure, so it bounds every single one."""
+IRLS_STEPS = 2
+"""First steps with re-weighting only: far from the optimum most corners are beyond the threshold, and without
+their curvature along the residual nothing would hold the step."""
 GATE = 3.0
 """After Huber has converged, what is further off than this many times its threshold is no measurement: its weight
 becomes zero, and the rest is adjusted again. Gated from the start, a bad start would throw away good corners."""
@@ -109,7 +112,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
     sigmas, converged, used = np.inf, False, 0
     while used < limit and not converged:
         used += 1
-        chains, C, g_z = linearise(problem, values, weights)
+        chains, C, g_z = linearise(problem, values, weights, newton=used > IRLS_STEPS)
         shorten = 1.0
         for attempt in range(TRIES):
             step = _solve(chains, C, g_z, damping[stretch])
@@ -136,7 +139,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
         worse = rise > 0.01 * before + 1.0
         local, prior = trial_local, trial_prior
         sigmas = np.sqrt(max(decrease, 0.0))
-        converged = sigmas < STEP_SIGMAS and shorten == 1.0 and np.all(damping < 1e-2)
+        converged = bool(sigmas < STEP_SIGMAS and shorten == 1.0 and np.all(damping < 1e-2))
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
         damping[worse] = np.maximum(damping[worse], DAMPING_FIRST)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.estimation import motion
+from pipeline.estimation import blocks, motion
 from pipeline.estimation.arrow import Chain
 from pipeline.estimation.residuals import (
     Corners,
@@ -29,8 +29,8 @@ from pipeline.network.model import Network
 
 FIRST_POSE = np.array([100.0] * 3 + [np.pi] * 3)
 FIRST_RATE = np.array([3.0] * 3 + [1.5] * 3)
-"""Prior sigmas of the first epoch's state about its start (m, rad) and about rest (m/s, rad/s): what every machine obeys.
-It holds what a log of one frame leaves free, and is worth nothing against a second frame."""
+"""Prior sigmas of the first epoch's state about its start (m, rad) and about rest (m/s, rad/s), as every machine
+obeys. It holds what a log of one frame leaves free, and is worth nothing against a second frame."""
 LOST = 1e3
 """Whitened length that a corner behind its camera, or a reading out of the linkage's reach, counts with."""
 
@@ -163,6 +163,7 @@ def huber(length, k: float, alive):
     length : (...,) array
         nan counts as lost: no weight, a large cost.
     k : float
+        The length beyond which the loss grows linearly.
     alive : (...,) bool array
         Where False: neither weight nor cost.
 
@@ -201,12 +202,24 @@ def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
     for k in range(len(problem.tie.variables)):
         e, _, _ = motion_residual(problem, values, k, jacobians=False)
         local[:-1] += 0.5 * np.sum(e**2, axis=-1)
-        local[0] += 0.5 * np.sum(_first(problem, values, k)[0] ** 2)
+        local[0] += 0.5 * np.sum(first_residual(problem, values, k)[0] ** 2)
     return local, 0.5 * float(values.z @ values.z)
 
 
-def linearise(problem: Problem, values: Values, weights: Weights):
+def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
     """Normal equations at the given values, after re-weighting.
+
+    Parameters
+    ----------
+    problem : Problem
+        All measurements.
+    values : Values
+        Where to linearise.
+    weights : Weights
+        What counts; the robust weights follow from the residuals at ``values``.
+    newton : bool
+        Take the curvature of Huber's loss as it is: beyond the threshold there is none along the residual. For steps
+        only; re-weighting alone converges linearly, 40 iterations where this takes 10. Never for covariances.
 
     Returns
     -------
@@ -223,14 +236,10 @@ def linearise(problem: Problem, values: Values, weights: Weights):
     C, g_z = np.eye(p), values.z.copy()
     for group, alive in zip(problem.corners, weights.corners, strict=True):
         r, J = corner_residuals(group, values, problem.statics)
-        assert J is not None
-        weight, _ = huber(lengths(r, 2), weights.huber, alive)
-        _add(problem, chains, C, g_z, group.epoch, r, J, np.repeat(weight, 2, axis=1))
+        _add(problem, chains, C, g_z, group.epoch, r, J, 2, weights.huber, alive, newton)
     for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
         r, J = sensor_residuals(readings, values, problem.statics)
-        assert J is not None
-        weight, _ = huber(lengths(r, 1), weights.huber, alive)
-        _add(problem, chains, C, g_z, readings.epoch, r, J, weight)
+        _add(problem, chains, C, g_z, readings.epoch, r, J, 1, weights.huber, alive, newton)
     for k in range(len(problem.tie.variables)):
         c, at = problem.place(k)
         chain = chains[c]
@@ -241,7 +250,7 @@ def linearise(problem: Problem, values: Values, weights: Weights):
         chain.A[:, at, at] += J_1t @ J_2
         chain.g[:-1, at] += np.einsum("nij,nj->ni", J_1t, e)
         chain.g[1:, at] += np.einsum("nij,nj->ni", J_2t, e)
-        e, J = _first(problem, values, k)
+        e, J = first_residual(problem, values, k)
         chain.D[0, at, at] += J.T @ J
         chain.g[0, at] += J.T @ e
     return chains, C, g_z
@@ -255,44 +264,57 @@ def _columns(problem: Problem, chain: int):
         if moving and moving[0] in problem.chains[chain]:
             met.update(s.edge.index for s in group.path if s.edge.kind == "static")
             met.add(group.intrinsics)
+            met.update(c for k in moving if (c := problem.statics.clocks[k]) is not None)
     for readings in problem.sensors:
         if readings.variable in problem.chains[chain]:
             sensor = readings.sensor
-            met.update(
-                {sensor.curve, sensor.offset} | ({sensor.linkage} if sensor.linkage is not None else set())
-            )
+            clock = problem.statics.clocks[readings.variable]
+            assert clock is not None
+            met.update({sensor.curve, sensor.offset, clock})
+            if sensor.linkage is not None:
+                met.add(sensor.linkage)
     parts = [problem.statics.columns[s] for s in sorted(met)]
     return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
 
 
-def _add(problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, weight) -> None:
-    """Add one group of measurements, (n, m) residuals of weights (n, m) at rising epochs."""
-    use = weight > 0
+def _add(
+    problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, group: int, k: float, alive, newton
+) -> None:
+    """Add measurements, (n, m) whitened residuals at rising epochs, weighed in vectors of ``group`` components."""
+    length = lengths(r, group)
+    weight, _ = huber(length, k, alive)
+    use = np.repeat(weight > 0, group, axis=1)
     r = np.where(use, r, 0.0)
     n, m = r.shape
+    parts = [*J.variables.values(), *J.statics.values()]
+    A = np.where(use[..., None], np.concatenate(parts, axis=-1), 0.0)
+    wA = np.repeat(weight, group, axis=1)[..., None] * A
+    wr = np.repeat(weight, group, axis=1) * r
+    if newton:
+        # Past the threshold the loss is a cone: it bends across the residual, not along it.
+        along = np.where((weight > 0) & (weight < 1), 1 / np.maximum(length, k), 0.0)
+        unit = (r.reshape(n, -1, group) * along[..., None])[..., None]
+        wA_v = wA.reshape(n, -1, group, A.shape[-1])
+        wA = (wA_v - unit * np.sum(unit * wA_v, axis=2, keepdims=True)).reshape(A.shape)
     z = np.concatenate([problem.statics.columns[s] for s in J.statics]) if J.statics else np.array([], int)
-    J_z = np.concatenate(list(J.statics.values()), axis=-1) if J.statics else np.zeros((n, m, 0))
-    J_z = np.where(use[..., None], J_z, 0.0)
-    wJ_z = weight[..., None] * J_z
-    C[np.ix_(z, z)] += wJ_z.reshape(n * m, -1).T @ J_z.reshape(n * m, -1)
-    g_z[z] += wJ_z.reshape(n * m, -1).T @ r.ravel()
+    count = A.shape[-1] - len(z)
+    wAr = np.concatenate([wA, wr[..., None]], axis=-1)
+    square = blocks.gram(A.reshape(n * m, -1)[:, count:], wAr.reshape(n * m, -1)[:, count:])
+    C[np.ix_(z, z)] += square[:, :-1]
+    g_z[z] += square[:, -1]
     if not J.variables:
         return
-    places = {k: problem.place(k) for k in J.variables}
+    places = {v: problem.place(v) for v in J.variables}
     chain = chains[next(iter(places.values()))[0]]
     x = np.concatenate([np.arange(at.start, at.stop) for _, at in places.values()])
-    J_x = np.where(use[..., None], np.concatenate(list(J.variables.values()), axis=-1), 0.0)
-    wJ_xt = np.swapaxes(weight[..., None] * J_x, -1, -2)
+    A_xt = np.swapaxes(A[..., :count], -1, -2)
     starts = np.flatnonzero(np.r_[True, np.diff(epoch) > 0])
     at = epoch[starts]
-
-    def per_epoch(blocks):
-        return np.add.reduceat(blocks, starts, axis=0)
-
-    chain.D[np.ix_(at, x, x)] += per_epoch(wJ_xt @ J_x)
-    chain.g[np.ix_(at, x)] += per_epoch((wJ_xt @ r[..., None])[..., 0])
+    both = np.add.reduceat(A_xt @ wAr, starts, axis=0)
+    chain.D[np.ix_(at, x, x)] += both[..., :count]
+    chain.g[np.ix_(at, x)] += both[..., -1]
     if len(z):
-        chain.B[np.ix_(at, x, np.searchsorted(chain.columns, z))] += per_epoch(wJ_xt @ J_z)
+        chain.B[np.ix_(at, x, np.searchsorted(chain.columns, z))] += both[..., count:-1]
 
 
 def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):
@@ -307,7 +329,7 @@ def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):
     return motion.whiten(e, W, root), motion.whiten(J_1, W, root), motion.whiten(J_2, W, root)
 
 
-def _first(problem: Problem, values: Values, k: int):
+def first_residual(problem: Problem, values: Values, k: int):
     """Weak prior of the first epoch's state: residual and Jacobian."""
     T, T_start, w = values.pose[k][0], problem.first.pose[k][0], values.rate[k][0]
     if problem.tie.variables[k].kind == "joint":

@@ -56,9 +56,13 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
     Parameters
     ----------
     corners : Corners
+        One group.
     values : Values
+        Of all unknowns.
     statics : Statics
+        How values follow from the unknowns.
     jacobians : bool
+        Whether to compute them; else None comes back in their place.
 
     Returns
     -------
@@ -87,9 +91,12 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
         J_rho = step.sign * (J_r_p @ R[..., None, :, :])
         # d p_camera = R [I, -hat(p_child)] xi; a' hat(b) = (a x b)', row by row.
         if step.edge.kind == "joint":
-            J = np.zeros((n, 4, 2, 2))
-            J[..., 0] = -np.cross(J_rho, p_child[:, :, None, :])[..., TURN_COLUMN - 3]
-            by_variable[index] = J.reshape(n, 8, 2)
+            J_turn = -np.cross(J_rho, p_child[:, :, None, :])[..., TURN_COLUMN - 3].reshape(n, 8)
+            by_variable[index] = J_turn[..., None] * np.array([1.0, -statics.clock_error(index, values.z)])
+            clock = statics.clocks[index]
+            if clock is not None and len(statics.columns[clock]):
+                J_clock = -J_turn * values.rate[index][corners.epoch][:, None]
+                by_static[clock] = J_clock[..., None] @ statics.sensitivity(clock, values.z)
             continue
         J = np.concatenate([J_rho, -np.cross(J_rho, p_child[:, :, None, :])], axis=-1)
         if step.edge.kind == "moving":
@@ -135,7 +142,8 @@ def sensor_residuals(readings: SensorReadings, values: Values, statics: Statics,
 
     Both the length of the cylinder (or the angle) and the curve are compared on the measured side, because the curve
     runs from raw to measured and its inverse would have to be solved for. The angle is taken
-    at the true time of the reading, ``angle + rate (dt + d_offset)``.
+    at the time of the reading, ``angle + rate dt``. The first sensor of a joint is its clock (see ``Variable.clock``);
+    a second one is late against it by the difference of their offsets' errors.
 
     Returns
     -------
@@ -144,8 +152,11 @@ def sensor_residuals(readings: SensorReadings, values: Values, statics: Statics,
     J : Jacobians or None
     """
     sensor, k = readings.sensor, readings.variable
-    offset = statics.value(sensor.offset, values.z)[0] - statics.base[sensor.offset][0]
-    dt = readings.dt_s + offset
+    own_clock = statics.clocks[k] == sensor.offset
+    dt = readings.dt_s
+    if not own_clock:
+        late = statics.value(sensor.offset, values.z)[0] - statics.base[sensor.offset][0]
+        dt = dt + late - statics.clock_error(k, values.z)
     rate = values.rate[k][readings.epoch]
     angle = values.pose[k][readings.epoch] + rate * dt
     curve = statics.value(sensor.curve, values.z)
@@ -173,11 +184,14 @@ def sensor_residuals(readings: SensorReadings, values: Values, statics: Statics,
     scale = 1 / readings.sigma[:, None, None]
     J_state = -np.stack([J_measured_angle, J_measured_angle * dt], axis=-1)[:, None, :] * scale
     by_static = {
-        sensor.curve: (unit * powers)[:, None, :] * scale @ statics.sensitivity(sensor.curve, values.z),
-        sensor.offset: (-J_measured_angle * rate)[:, None, None]
-        * scale
-        @ statics.sensitivity(sensor.offset, values.z),
+        sensor.curve: (unit * powers)[:, None, :] * scale @ statics.sensitivity(sensor.curve, values.z)
     }
+    if not own_clock:
+        J_late = (-J_measured_angle * rate)[:, None, None] * scale
+        by_static[sensor.offset] = J_late @ statics.sensitivity(sensor.offset, values.z)
+        clock = statics.clocks[k]
+        if clock is not None:
+            by_static[clock] = -J_late @ statics.sensitivity(clock, values.z)
     if sensor.linkage is not None:
         assert J_length_params is not None
         by_static[sensor.linkage] = (

@@ -1,4 +1,4 @@
-"""What an adjustment hands on: arrays that become the tables ``states``, ``statics``, ``residuals`` and solution.json."""
+"""What an adjustment hands on: arrays for the tables ``states``, ``statics``, ``residuals``, and for solution.json."""
 
 from __future__ import annotations
 

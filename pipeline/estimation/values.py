@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
+from pipeline.network.datum import Tie
 from pipeline.network.model import Network
 from pipeline.network.start import Start
 
@@ -23,6 +25,8 @@ class Statics:
     """(n, r) each; r may be 0: exact."""
     columns: tuple[np.ndarray, ...]
     """(r,) each, their places in ``z``."""
+    clocks: tuple[int | None, ...]
+    """Per variable: the time offset of the sensor in whose time its states stand."""
     size: int
     """p, how many unknowns there are in all."""
 
@@ -35,6 +39,11 @@ class Statics:
             self.base[index] if len(self.columns[index]) == 0 else se3.retract(self.base[index], correction)
         )
 
+    def clock_error(self, variable: int, z) -> float:
+        """How much later the states of a joint are, in truth, than their epochs say, seconds."""
+        clock = self.clocks[variable]
+        return 0.0 if clock is None else float((self.scale[clock] @ z[self.columns[clock]])[0])
+
     def sensitivity(self, index: int, z):
         """(n, r): change of the value, or right perturbation of the pose, by its unknowns."""
         scale = self.scale[index]
@@ -43,12 +52,19 @@ class Statics:
         return se3.Jr(scale @ z[self.columns[index]]) @ scale
 
 
-def statics_of(network: Network, start: Start) -> Statics:
+def statics_of(network: Network, tied: Tie, start: Start) -> Statics:
     """The unknowns of all statics, in the network's order."""
     scale = tuple(s.scale for s in network.statics)
     ends = np.cumsum([0] + [m.shape[1] for m in scale])
-    columns = tuple(np.arange(a, b) for a, b in zip(ends[:-1], ends[1:], strict=True))
-    return Statics(start.statics, tuple(s.is_pose for s in network.statics), scale, columns, int(ends[-1]))
+    columns = tuple(np.arange(a, b) for a, b in pairwise(ends))
+    return Statics(
+        start.statics,
+        tuple(s.is_pose for s in network.statics),
+        scale,
+        columns,
+        tuple(v.clock for v in tied.variables),
+        int(ends[-1]),
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,4 +95,6 @@ class Values:
         if edge.kind == "static":
             return statics.value(edge.index, self.z)
         value = self.pose[edge.index][epoch]
-        return value if edge.kind == "moving" else fr.turn(value)
+        if edge.kind == "moving":
+            return value
+        return fr.turn(value - self.rate[edge.index][epoch] * statics.clock_error(edge.index, self.z))

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody, Motion, StaticBody
-from pipeline.config.quantities import Pose
+from pipeline.config.quantities import Pose, Print
 from pipeline.config.site import Benchmark
 from pipeline.errors import NetworkError
 from pipeline.geometry import camera as camera_model
@@ -91,7 +91,8 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
         size = camera.intrinsics.width, camera.intrinsics.height
         cameras.append(Camera(name, camera.body, mount, add(intrinsics), *size))
 
-    markers, prints = [], []
+    markers: list[Marker] = []
+    prints: list[Print] = []
     for name, marker in machine.markers.items():
         markers.append(
             Marker(name, marker.body, add_pose(f"marker {name} mount", "mounts", marker.mount), False)

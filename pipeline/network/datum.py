@@ -41,7 +41,11 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
     pairs = Counter(
         zip(observations.camera.tolist(), network.tag_marker[observations.tag].tolist(), strict=True)
     )
-    read = {s.joint for s in network.sensors if s.name in readings and len(readings[s.name].time_ns)}
+    read = {
+        s.joint: s.offset
+        for s in reversed(network.sensors)
+        if s.name in readings and len(readings[s.name].time_ns)
+    }
     warnings = _unseen(network, pairs)
     anchors = _anchors(network, pairs)
 
@@ -70,18 +74,16 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
                 continue
             edges[fr.axis_frame(name)] = fr.Edge(fr.body_frame(body.parent), "static", body.static)
             edges[frame] = fr.Edge(fr.axis_frame(name), "joint", len(variables))
-            variables.append(fr.Variable(name, "joint", body.motion))
+            variables.append(fr.Variable(name, "joint", body.motion, read.get(name)))
     # A joint hangs on its parent: where the parent is left out, so are its children.
     gone = {n for n in network.bodies if set(_lineage(network, n)) & set(left_out)}
     needed = [n for n in _needed(network, anchors) if n in gone]
     if needed:
-        raise NetworkError(_why_not_tied(network, needed[0], pairs, read))
+        raise NetworkError(_why_not_tied(network, needed[0], pairs))
     for name in gone:
         edges.pop(fr.body_frame(name), None)
         edges.pop(fr.axis_frame(name), None)
-        warnings.append(
-            _why_not_tied(network, name, pairs, read).split("; ")[0] + ": left out of the adjustment"
-        )
+        warnings.append(_why_not_tied(network, name, pairs).split("; ")[0] + ": left out of the adjustment")
     kept = [k for k, v in enumerate(variables) if v.body not in gone]
     renumbered = {old: new for new, old in enumerate(kept)}
     edges = {
@@ -184,7 +186,7 @@ def _needed(network: Network, anchors: dict[str, str]) -> list[str]:
         at = next(h.body for h in hosts if h.name == name)
 
 
-def _why_not_tied(network: Network, name: str, pairs: Counter, read: set[str]) -> str:
+def _why_not_tied(network: Network, name: str, pairs: Counter) -> str:
     body = network.bodies[name]
     family = [n for n in network.bodies if name in _lineage(network, n)]
     markers = [m.name for m in network.markers if m.body in family]

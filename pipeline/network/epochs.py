@@ -54,6 +54,7 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
     Parameters
     ----------
     network : Network
+        Of the sensors and their nominal time offsets.
     observations : Observations
         In any order; the second of two sightings of one tag by one camera at one instant is dropped.
     readings : dict of str to Readings

@@ -63,6 +63,11 @@ class Variable:
     kind: str
     """moving: pose (6) and velocity (6); joint: angle and rate."""
     motion: tuple[float, float]
+    clock: int | None = None
+    """Of a joint that a sensor reads: index of that sensor's time offset. The joint's states stand at the sensor's
+    times as the file corrects them; whoever uses its angle at another clock's time turns back by rate times the
+    error of that correction. So an offset that nothing else can see stays at its prior. With the offset in the sensor's
+    own residual, extrapolation was traded against the motion prior: it ran off by 8.6 of its sigmas."""
 
     @property
     def size(self) -> int:
@@ -114,6 +119,7 @@ def along(path, edge_pose):
     Parameters
     ----------
     path : sequence of Step
+        From ``Frames.path``, or a part of one.
     edge_pose : callable
         ``edge_pose(edge)`` gives ``T_parent_child``, (4, 4) or (n, 4, 4).
 

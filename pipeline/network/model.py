@@ -11,8 +11,6 @@ SOURCES = ("benchmarks", "mounts", "intrinsics", "linkage and sensor", "cutting 
 
 POSE_COMPONENTS = ("x", "y", "z", "rx", "ry", "rz")
 POSE_UNITS = ("m", "m", "m", "rad", "rad", "rad")
-EXACT_BELOW = 1e-18
-"""Eigenvalue of a prior covariance, against its largest or one unit squared, below which a direction is exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +127,10 @@ class Network:
 
         Parameters
         ----------
-        family : sequence of str
+        family : (n,) sequence of str
+            Such as tag36h11.
         tag_id : (n,) int array
+            Decoded ids.
 
         Returns
         -------

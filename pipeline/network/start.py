@@ -109,17 +109,19 @@ class _Search:
         if which is None or ("joint", which) not in self.unknown:
             return
         measured = np.polynomial.polynomial.polyval(data.raw, self.statics[sensor.curve])
+        stroke = None
         if sensor.linkage is None:
             angle = np.deg2rad(measured)
         else:
-            angle = linkage.bucket_angle(measured, self.statics[sensor.linkage], sensor.side)
+            params = self.statics[sensor.linkage]
+            angle = linkage.bucket_angle(measured, params, sensor.side)
+            stroke = np.round(linkage.stroke(params, sensor.side), 4).tolist()
         good = np.isfinite(angle)
         if not np.any(good):
             raise NetworkError(
-                f"no reading of sensor '{sensor.name}' gives an angle: its curve leads to "
-                f"{np.min(measured):.4g} to {np.max(measured):.4g} {sensor.output.split('_')[1]}, outside the stroke "
-                f"{np.round(linkage.stroke(self.statics[sensor.linkage], sensor.side), 4).tolist()} m of the linkage; "
-                f"check the curve's coefficients, the linkage's sizes and its branch"
+                f"no reading of sensor '{sensor.name}' gives an angle: its curve leads to {np.min(measured):.4g} to "
+                f"{np.max(measured):.4g} m, outside the stroke {stroke} m of the linkage; check the curve's "
+                f"coefficients, the linkage's sizes and its branch"
             )
         t = self.time_s[data.epoch[good]] + data.dt_s[good]
         angle = np.unwrap(angle[good])
@@ -207,6 +209,7 @@ def geodesic(t, T, at):
     t : (n,) array
         Seconds, rising.
     T : (n, 4, 4) array
+        Poses at these times.
     at : (k,) array
         Seconds.
 
@@ -234,11 +237,11 @@ def _views(network: Network, tie: Tie, epochs: Epochs) -> Iterator[_View]:
                 continue
             tags = np.flatnonzero(network.tag_marker == m)
             frames, frame = np.unique(epochs.epoch[rows], return_inverse=True)
-            xy = np.full((len(frames), len(tags), 4, 2), np.nan)
-            xy[frame, np.searchsorted(tags, seen.tag[rows])] = camera_model.undistort(
+            rays = np.full((len(frames), len(tags), 4, 2), np.nan)
+            rays[frame, np.searchsorted(tags, seen.tag[rows])] = camera_model.undistort(
                 seen.uv[rows], intrinsics
             )
-            xy = xy.reshape(len(frames), -1, 2)
+            xy = rays.reshape(len(frames), -1, 2)
             visible = np.isfinite(xy).all(axis=-1)
             enough = visible.sum(-1) >= 4
             xy, visible, frames = (

@@ -1,8 +1,8 @@
 """Corners and readings of a small machine whose truth is drawn: the oracle of the adjustment's tests.
 
 The paper's prototype (Fig. 1): two cameras on the cab, one looking at three boards, one at a board on the stick, and a
-linear potentiometer on the bucket's cylinder. The files hold nominal values; the truth differs from them by draws from the
-files' own covariances, and moves as the motion prior says. Pictures are OpenCV's, not ours.
+linear potentiometer on the bucket's cylinder. The files hold nominal values; the truth differs from them by draws from
+the files' own covariances, and moves as the motion prior says. Pictures are OpenCV's, not ours.
 """
 
 from __future__ import annotations
@@ -171,7 +171,8 @@ class Options:
     frame_s: float = 0.2
     reading_s: float = 0.2
     bucket_marker: bool = False
-    """A marker on the bucket instead of the potentiometer."""
+    """A marker on the bucket."""
+    potentiometer: bool = True
     outliers: float = 0.0
     """Share of corners thrown off by 3 to 20 px."""
     blind: tuple[tuple[float, float], ...] = ()
@@ -226,6 +227,7 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
     document = copy.deepcopy(o.machine)
     if o.bucket_marker:
         document["markers"]["bucket"] = copy.deepcopy(BUCKET_MARKER)
+    if not o.potentiometer:
         document.pop("sensors", None)
     machine, site = Machine.model_validate(document), Site.model_validate(o.site)
     network = network_of(machine, site)
@@ -255,7 +257,7 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
     )
     T_camera_stick = _wander(rng, T_dig_stick0, t, motion["stick"])
     T_stick = T_cab @ by_name["camera dig mount"] @ T_camera_stick
-    angle, rate = _turn(rng, np.deg2rad(-15.0), t, motion["bucket"].rotation)
+    angle, _rate = _turn(rng, np.deg2rad(-15.0), t, motion["bucket"].rotation)
     T_bucket = T_stick @ by_name["joint bucket axis"] @ _rotz(angle)
     T_world = {
         "cab": T_cab,
@@ -326,7 +328,7 @@ def picture(T_camera_marker, p_marker, intrinsics):
 
 
 def _of(T_world, body, rows):
-    return np.eye(4) if body == "world" else T_world[body][rows]
+    return se3.identity((len(rows),)) if body == "world" else T_world[body][rows]
 
 
 def _level(xyz):

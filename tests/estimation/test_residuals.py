@@ -1,0 +1,174 @@
+"""Every Jacobian of the adjustment against central differences, in one test."""
+
+import numpy as np
+import pytest
+
+from pipeline.estimation import motion
+from pipeline.estimation.adjust import problem_of_log
+from pipeline.estimation.problem import first_residual, motion_residual
+from pipeline.estimation.residuals import corner_residuals, sensor_residuals
+from pipeline.network import Readings
+from pipeline.network.datum import tie
+from pipeline.network.epochs import epochs_of
+from tests.estimation.simulator import MACHINE, Options, draw
+
+
+def _document():
+    """A potentiometer and an angle sensor on the same joint, a marker on the bucket, and a site camera."""
+    import copy
+
+    document = copy.deepcopy(MACHINE)
+    document["sensors"]["angle"] = {
+        "topic": "/angle",
+        "joint": "bucket",
+        "curve": {"output": "angle_deg", "coefficients": [1.0, 0.9], "sigma": [0.5, 0.01]},
+        "noise": 0.2,
+        "sigma_time_offset_s": 0.002,
+    }
+    document["cameras"]["site"] = copy.deepcopy(document["cameras"]["dig"])
+    document["cameras"]["site"] |= {
+        "body": "world",
+        "topic": "/site",
+        "mount": {"xyz_m": [3.0, 1.0, 1.5], "rpy_deg": [-90.0, 0.0, 25.0], "sigma_mm": 3.0, "sigma_deg": 0.1},
+    }
+    return document
+
+
+@pytest.fixture(scope="module")
+def at():
+    """A small problem, and values well away from its priors and its optimum."""
+    d = draw(5, Options(epochs=5, machine=_document(), bucket_marker=True))
+    readings = d.readings | {
+        "angle": Readings(d.readings["pot"].time_ns + 7_000_000, np.linspace(-20, -10, 5))
+    }
+    tied = tie(d.network, d.observations, readings)
+    problem = problem_of_log(d.network, tied, epochs_of(d.network, d.observations, readings))
+    rng = np.random.default_rng(1)
+    E = len(problem.epochs.time_ns)
+    deltas = [0.02 * rng.standard_normal((E, v.size)) for v in tied.variables]
+    values = problem.first.retract(deltas, 0.7 * rng.standard_normal(problem.statics.size))
+    return problem, values
+
+
+def _nudged(problem, values, variable, component, step):
+    deltas = [np.zeros((len(problem.epochs.time_ns), v.size)) for v in problem.tie.variables]
+    deltas[variable][:, component] = step
+    return values.retract(deltas, np.zeros(problem.statics.size))
+
+
+def _nudged_static(problem, values, column, step):
+    deltas = [np.zeros((len(problem.epochs.time_ns), v.size)) for v in problem.tie.variables]
+    dz = np.zeros(problem.statics.size)
+    dz[column] = step
+    return values.retract(deltas, dz)
+
+
+def _difference(residual, nudge, h=1e-6):
+    return (residual(nudge(h)) - residual(nudge(-h))) / (2 * h)
+
+
+def _check(analytic, numeric, what):
+    scale = np.abs(numeric).max() + 1e-3 * max(np.abs(analytic).max(), 1.0)
+    assert np.abs(analytic - numeric).max() < 2e-6 * max(scale, 1.0), what
+
+
+@pytest.mark.parametrize("kind", ["corner", "sensor"])
+def test_measurement_jacobians_match_central_differences(at, kind):
+    problem, values = at
+    groups = problem.corners if kind == "corner" else problem.sensors
+    function = corner_residuals if kind == "corner" else sensor_residuals
+    assert groups
+    seen_variables, seen_statics = set(), set()
+    for group in groups:
+
+        def residual(v, group=group):
+            return function(group, v, problem.statics, jacobians=False)[0]
+
+        r, J = function(group, values, problem.statics)
+        assert np.isfinite(r).all()
+        for k, variable in enumerate(problem.tie.variables):
+            given = J.variables.get(k, np.zeros(r.shape + (variable.size,)))
+            for i in range(variable.size):
+                numeric = _difference(residual, lambda h, k=k, i=i: _nudged(problem, values, k, i, h))
+                _check(given[..., i], numeric, (kind, variable.body, i))
+        for s, static in enumerate(problem.network.statics):
+            columns = problem.statics.columns[s]
+            given = J.statics.get(s, np.zeros(r.shape + (len(columns),)))
+            for i, column in enumerate(columns):
+                numeric = _difference(residual, lambda h, c=column: _nudged_static(problem, values, c, h))
+                _check(given[..., i], numeric, (kind, static.name, i))
+        seen_variables |= set(J.variables)
+        seen_statics |= {problem.network.statics[s].source for s in J.statics}
+    assert seen_variables == ({0, 1, 2} if kind == "corner" else {2})
+    if kind == "corner":  # the bucket's own clock reaches the corners of its marker
+        assert {"benchmarks", "mounts", "intrinsics", "linkage and sensor", "time offset"} <= seen_statics
+    else:
+        assert {"linkage and sensor", "time offset"} == seen_statics
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_motion_jacobians_match_central_differences(at, k):
+    problem, values = at
+    _, J_1, J_2 = motion_residual(problem, values, k)
+    size = problem.tie.variables[k].size
+
+    for J, neighbour in ((J_1, 0), (J_2, 1)):
+        for i in range(size):
+
+            def nudge(h, i=i, neighbour=neighbour):
+                # Every other epoch, so that each interval has one end moved.
+                out = []
+                for parity in range(2):
+                    deltas = [np.zeros((len(problem.epochs.time_ns), v.size)) for v in problem.tie.variables]
+                    deltas[k][parity::2, i] = h
+                    out.append(values.retract(deltas, np.zeros(problem.statics.size)))
+                return out
+
+            def residual(pair, neighbour=neighbour):
+                e = [motion_residual(problem, v, k, jacobians=False)[0] for v in pair]
+                first = np.arange(len(e[0])) % 2 == neighbour
+                return np.where(first[:, None], e[0], e[1])
+
+            numeric = _difference(residual, nudge, 1e-5)
+            scale = np.abs(J).max(axis=(1, 2))[:, None]
+            assert np.abs((J[..., i] - numeric) / scale).max() < 1e-7, (k, neighbour, i)
+
+
+@pytest.mark.parametrize("k", [0, 2])
+def test_first_epoch_prior_jacobian_matches_central_differences(at, k):
+    problem, values = at
+    _, J = first_residual(problem, values, k)
+    for i in range(J.shape[1]):
+        numeric = _difference(
+            lambda v: first_residual(problem, v, k)[0], lambda h, i=i: _nudged(problem, values, k, i, h)
+        )
+        assert np.abs(J[:, i] - numeric).max() < 1e-6
+
+
+def test_motion_whitening_inverts_the_integrated_white_noise():
+    dt = np.array([1e-4, 0.2, 600.0])
+    W = motion.whitening(dt)
+    for w, t in zip(W, dt, strict=True):
+        Q = np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+        np.testing.assert_allclose(w @ Q @ w.T, np.eye(2), atol=1e-9)
+
+
+def test_motion_residual_is_that_of_gtsam():
+    gtsam = pytest.importorskip("gtsam")
+    from pipeline.geometry import se3
+
+    rng = np.random.default_rng(0)
+    dt, q = 0.3, np.array([0.3, 0.3, 0.3, 0.03, 0.03, 0.03])
+    T_1, T_2 = (se3.exp(0.5 * rng.standard_normal(6)) for _ in range(2))
+    w_1, w_2 = rng.standard_normal((2, 6))
+    e, _, _ = motion.pose_residual(
+        T_1[None], w_1[None], T_2[None], w_2[None], np.array([dt]), jacobians=False
+    )
+    ours = motion.whiten(e, motion.whitening(np.array([dt])), np.sqrt(q))
+    values = gtsam.Values()
+    for key, T, w in ((0, T_1, w_1), (1, T_2, w_2)):
+        values.insert(key, gtsam.Pose3(T))
+        values.insert(key + 10, se3.swap_rotation_first(w))
+    ends = gtsam.StateData(0, 10, 0.0), gtsam.StateData(1, 11, dt)
+    factor = gtsam.WnoaMotionFactorPose3(*ends, se3.swap_rotation_first(q))
+    assert factor.error(values) == pytest.approx(0.5 * float(np.sum(ours**2)), rel=1e-9)
