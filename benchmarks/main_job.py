@@ -52,7 +52,11 @@ class Score:
 def score(log: Path, runs: Path) -> Score:
     """Run the main job on one log and hold what came out against the truth beside the log."""
     start = time.monotonic()
-    subprocess.run([sys.executable, "-m", "pipeline", "report", str(log), "--runs", str(runs)], check=True, stdout=subprocess.DEVNULL)
+    subprocess.run(
+        [sys.executable, "-m", "pipeline", "report", str(log), "--runs", str(runs)],
+        check=True,
+        stdout=subprocess.DEVNULL,
+    )
     seconds = time.monotonic() - start
     run = runs / log.stem
     edge = read_table(run / "cutting_edge.parquet", "cutting_edge")
@@ -63,7 +67,9 @@ def score(log: Path, runs: Path) -> Score:
     time_ns, height, sigma = edge["time_ns"][middle], edge["h"][middle], np.sqrt(edge["cov_h_h"][middle])
     digging = _phase_at(truth, time_ns) == "dig"
     reference_ns = time_ns[0]
-    true_height = np.interp(time_ns - reference_ns, truth["time_ns"].to_numpy() - reference_ns, truth["h"].to_numpy())
+    true_height = np.interp(
+        time_ns - reference_ns, truth["time_ns"].to_numpy() - reference_ns, truth["h"].to_numpy()
+    )
     error = (height - true_height)[digging]
     sigma = sigma[digging]
     stations = read_table(run / "stations.parquet", "stations")
@@ -85,7 +91,9 @@ def score(log: Path, runs: Path) -> Score:
 
 def _phase_at(truth, time_ns: np.ndarray) -> np.ndarray:
     """Phase of the work at each time: that of the nearest earlier sample of the truth."""
-    index = np.clip(np.searchsorted(truth["time_ns"].to_numpy(), time_ns, side="right") - 1, 0, len(truth) - 1)
+    index = np.clip(
+        np.searchsorted(truth["time_ns"].to_numpy(), time_ns, side="right") - 1, 0, len(truth) - 1
+    )
     return truth["phase"].to_numpy().astype(str)[index]
 
 
@@ -93,7 +101,10 @@ def _station_errors(stations: dict, truth) -> np.ndarray:
     """As-built floor of each station that was judged, minus the true floor there, metres."""
     judged = np.isfinite(stations["h"]) & (stations["verdict"] != "NOT REACHED")
     true_floor = dict(zip(np.round(truth["station"], 4), truth["h"], strict=True))
-    errors = [h - true_floor.get(round(s, 4), np.nan) for s, h in zip(stations["station"][judged], stations["h"][judged], strict=True)]
+    errors = [
+        h - true_floor.get(round(s, 4), np.nan)
+        for s, h in zip(stations["station"][judged], stations["h"][judged], strict=True)
+    ]
     return np.array([e for e in errors if np.isfinite(e)])
 
 
@@ -114,7 +125,10 @@ def main() -> int:
         scores = [score(SAMPLE, folder / "runs")]
         for seed in options.seeds:
             scores.append(score(draw(seed, folder), folder / f"seed{seed}" / "runs"))
-    print(f"{'log':<10}{'epochs':>7}{'RMSE mm':>9}{'sigma mm':>10}{'ratio':>7}{'95 % holds':>12}{'worst station mm':>18}{'verdict':>13}{'s':>7}")
+    print(
+        f"{'log':<10}{'epochs':>7}{'RMSE mm':>9}{'sigma mm':>10}{'ratio':>7}"
+        f"{'95 % holds':>12}{'worst station mm':>18}{'verdict':>13}{'s':>7}"
+    )
     for row in scores:
         print(
             f"{row.name:<10}{row.epochs:>7}{1e3 * row.rmse_m:>9.1f}{1e3 * row.median_sigma_m:>10.1f}"
@@ -135,7 +149,8 @@ def main() -> int:
     )
     line = (
         f"main-job: sample RMSE {1e3 * sample.rmse_m:.1f} mm (15), drawn {1e3 * worst_drawn:.1f} mm (10), "
-        f"RMSE/sigma {worst_ratio:.2f} (3), coverage {coverage:.1%} (90 to 99 %), worst station {1e3 * worst_station:.1f} mm (25.4)"
+        f"RMSE/sigma {worst_ratio:.2f} (3), coverage {coverage:.1%} (90 to 99 %), "
+        f"worst station {1e3 * worst_station:.1f} mm (25.4)"
     )
     keep_result("main_job", scores, line)
     print(line)
