@@ -21,6 +21,14 @@ def machine_class() -> str:
 def keep_result(name: str, rows: list[Any], line: str) -> None:
     """Write the rows (dataclasses or dicts) and the closing line of a benchmark."""
     FOLDER.mkdir(exist_ok=True)
-    plain = [dataclasses.asdict(row) if dataclasses.is_dataclass(row) and not isinstance(row, type) else row for row in rows]
-    result = {"date": datetime.date.today().isoformat(), "machine": machine_class(), "line": line, "rows": plain}
+    plain = [
+        dataclasses.asdict(row) if dataclasses.is_dataclass(row) and not isinstance(row, type) else row
+        for row in rows
+    ]
+    result = {
+        "date": datetime.date.today().isoformat(),
+        "machine": machine_class(),
+        "line": line,
+        "rows": plain,
+    }
     (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1, default=float) + "\n", encoding="utf-8")
