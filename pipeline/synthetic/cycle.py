@@ -24,6 +24,7 @@ CONTROL_S = 11.5
 SHAKE_HZ = (0.7, 4.0)
 SOIL_HOLDS = 0.5
 IDLE_LEVEL = 0.1  # of the shaking while cutting: the engine alone
+PEG_M = 0.06  # height of the control point above the ground, before the plan of the floor is added
 PHASES = ("dig", "swing", "dump", "return", "tram", "idle", "control")
 
 # One cycle, seconds from its beginning: reach from the far end of the sweep, height of the edge above the floor
@@ -69,6 +70,7 @@ class Motion:
         self._shake_phase = rng.uniform(0.0, 2 * np.pi, (6, 12))
         self._pass_extra = rng.uniform(15.0, 35.0, len(self.sweeps)) / 1000.0
         self._ground = rng.uniform(0.0, 2 * np.pi, (1, 2))
+        self.control_point = self._steered(np.array([np.mean(self.control_stop_s)]))[0]
 
     def _build(self, rng: np.random.Generator) -> None:
         spec = self.spec
@@ -108,18 +110,13 @@ class Motion:
     def _control(self, t: float) -> None:
         """Set the edge down on the control point beside the trench, hold still, take it away again."""
         spec = self.spec
-        place = self.place
         stand = self._plan["stand"][-1][1]
         angle, reach = np.deg2rad(spec.control_swing_deg), 5.9
         self.control_stop_s = (t + 3.4, t + 8.4)
         heading = self.place.bearing_rad + np.pi + angle
-        axis = place.point(stand, 0.0, spec.ground)
-        top = spec.ground + 0.06
-        self.control_point = np.array(
-            [*(axis[:2] + reach * np.array([np.cos(heading), np.sin(heading)])), top]
-        )
-        station, _ = place.station_offset(self.control_point)
-        height = top - float(np.interp(station, *np.array(spec.trench.rows).T))
+        peg = self.place.point(stand, 0.0, 0.0)[:2] + reach * np.array([np.cos(heading), np.sin(heading)])
+        station, _ = self.place.station_offset(peg)
+        height = spec.ground + PEG_M - float(np.interp(station, *np.array(spec.trench.rows).T))
         knots = {"reach": (reach, 0), "height": (height, 0), "bucket": (-98.0, 0), "swing": (angle, 0)}
         self._put(t + 0.2, bucket=(-66.0, 0), swing=(0, 0))
         self._put(t + 1.6, height=(height + 0.9, 0.0))
@@ -152,19 +149,24 @@ class Motion:
         t = np.asarray(t, float)
         spec = self.spec
         T_world_steady, shake = self._cab(t)
-        heading = self.place.bearing_rad + np.pi + self._curves["swing"](t)
-        reach, height = self._curves["reach"](t), self._curves["height"](t)
-        tip = self.place.point(self._curves["stand"](t), 0.0, spec.ground)
-        tip[:, 0] += reach * np.cos(heading)
-        tip[:, 1] += reach * np.sin(heading)
-        station, _ = self.place.station_offset(tip)
-        tip[:, 2] = self.floor(station) + self._extra(t, station) + height
+        tip = self._steered(t)
         # The soil holds the teeth, so the arm gives way to part of the shaking; the rest reaches the edge.
         T_world_felt = se3.retract(T_world_steady, SOIL_HOLDS * shake)
         tip_cab = se3.transform(se3.inverse(T_world_felt), tip)
         bucket = np.deg2rad(self._curves["bucket"](t))
         boom, stick = joint_directions(spec.arm, tip_cab[:, [0, 2]], bucket)
         return Poses(t, se3.retract(T_world_steady, shake), boom, stick, bucket)
+
+    def _steered(self, t: np.ndarray) -> np.ndarray:
+        """Where the operator wants the middle of the edge, (n, 3) in the world."""
+        heading = self.place.bearing_rad + np.pi + self._curves["swing"](t)
+        reach, height = self._curves["reach"](t), self._curves["height"](t)
+        tip = self.place.point(self._curves["stand"](t), 0.0, self.spec.ground)
+        tip[:, 0] += reach * np.cos(heading)
+        tip[:, 1] += reach * np.sin(heading)
+        station, _ = self.place.station_offset(tip)
+        tip[:, 2] = self.floor(station) + self._extra(t, station) + height
+        return tip
 
     def _extra(self, t: np.ndarray, station: np.ndarray) -> np.ndarray:
         """What a pass leaves for the next one to take: higher where the next pass will come again, and ripples."""
