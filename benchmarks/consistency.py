@@ -11,6 +11,7 @@ import time
 
 import numpy as np
 
+from benchmarks._results import keep_result
 from tests.estimation.monte_carlo import band, nees, sample, small
 
 RUNS = 200
@@ -25,7 +26,7 @@ def main() -> int:
     """Print the table and the verdict; 1 if a bar is missed."""
     print(f"{'network':22} {'runs':>4} {'edge /3':>9} {'band':>12} {'elevation':>9} {'pose /6':>9} {'band':>12} "
           f"{'statics':>7} {'cover 95':>8} {'s':>5}")  # fmt: skip
-    missed, figures = [], []
+    missed, figures, rows = [], [], []
     for name, marker, trust_files in CASES:
         runs = RUNS // 4 if trust_files else RUNS
         started = time.monotonic()
@@ -37,13 +38,17 @@ def main() -> int:
         print(f"{name:22} {runs:4d} {edge:9.2f} {three[0]:5.2f} .. {three[1]:4.2f} "
               f"{nees(found.elevation):9.2f} {pose:9.2f} {six[0]:5.2f} .. {six[1]:4.2f} {statics:7.2f} "
               f"{cover:8.3f} {time.monotonic() - started:5.0f}")  # fmt: skip
+        rows.append({"network": name, "runs": runs, "edge": edge, "edge_band": three, "pose": pose, "pose_band": six,
+                     "statics": statics, "cover_95": cover})  # fmt: skip
         if inside == trust_files:
             missed.append(name)
         bar = f"outside {three[0]:.2f}-{three[1]:.2f}" if trust_files else f"{three[0]:.2f}-{three[1]:.2f}"
         figures.append(f"{name} {edge:.2f} ({bar})")
-    print(
-        f"consistency: edge NEES {', '.join(figures)}" + (f"; MISSED: {', '.join(missed)}" if missed else "")
+    line = f"consistency: edge NEES {', '.join(figures)}" + (
+        f"; MISSED: {', '.join(missed)}" if missed else ""
     )
+    keep_result("consistency", rows, line)
+    print(line)
     return 1 if missed else 0
 
 

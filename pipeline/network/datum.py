@@ -79,11 +79,14 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
     gone = {n for n in network.bodies if set(_lineage(network, n)) & set(left_out)}
     needed = [n for n in _needed(network, anchors) if n in gone]
     if needed:
-        raise NetworkError(_why_not_tied(network, needed[0], pairs))
+        raise NetworkError(_why_not_tied(network, needed[0], pairs, set(network.bodies) - gone))
     for name in gone:
         edges.pop(fr.body_frame(name), None)
         edges.pop(fr.axis_frame(name), None)
-        warnings.append(_why_not_tied(network, name, pairs).split("; ")[0] + ": left out of the adjustment")
+        warnings.append(
+            _why_not_tied(network, name, pairs, set(network.bodies) - gone).split("; ")[0]
+            + ": left out of the adjustment"
+        )
     kept = [k for k, v in enumerate(variables) if v.body not in gone]
     renumbered = {old: new for new, old in enumerate(kept)}
     edges = {
@@ -186,23 +189,37 @@ def _needed(network: Network, anchors: dict[str, str]) -> list[str]:
         at = next(h.body for h in hosts if h.name == name)
 
 
-def _why_not_tied(network: Network, name: str, pairs: Counter) -> str:
+def _why_not_tied(network: Network, name: str, pairs: Counter, tied: set[str]) -> str:
     body = network.bodies[name]
-    family = [n for n in network.bodies if name in _lineage(network, n)]
-    markers = [m.name for m in network.markers if m.body in family]
-    cameras = [c.name for c in network.cameras if c.body in family]
-    if body.kind == "joint":
+    if body.kind == "joint" and (set(_lineage(network, name)) - {name}) <= tied:
+        beyond = [n for n in network.bodies if name in _lineage(network, n)]
+        markers = [m.name for m in network.markers if m.body in beyond]
         sensors = [s.name for s in network.sensors if s.joint == name]
         return (
             f"joint '{name}' has no reading of a sensor ({_listed(sensors)}) and no marker beyond it was seen "
             f"({_listed(markers)}); its angle is unknown: check the sensor's topic, or put a marker on it"
         )
-    saw = sorted({network.markers[m].name for c, m in pairs if network.cameras[c].name in cameras})
-    seen_by = sorted({network.cameras[c].name for c, m in pairs if network.markers[m].name in markers})
+    # Bodies that see each other but nothing surveyed are one fault, not several.
+    tied_together: set[str] = set()
+    grown = {_root(network, name)}
+    while grown - tied_together:
+        tied_together |= grown
+        for c, m in pairs:
+            ends = {_root(network, network.cameras[c].body), _root(network, network.markers[m].body)}
+            if ends & tied_together and not any(_is_datum(network, end) for end in ends):
+                grown |= ends
+    roots = sorted(tied_together)
+    family = [n for n in network.bodies if _root(network, n) in tied_together]
+    cameras = [c.name for c in network.cameras if c.body in family]
+    markers = [m.name for m in network.markers if m.body in family]
+    surveyed = [m.name for m in network.markers if m.benchmark]
+    bodies = (
+        f"body {_listed(roots)} is" if len(roots) == 1 else f"bodies {_listed(roots)} see each other but are"
+    )
     return (
-        f"body '{name}' is not tied to the datum: its cameras ({_listed(cameras)}) saw {_listed(saw)}, its markers "
-        f"({_listed(markers)}) were seen by {_listed(seen_by)}; let a camera on it see a benchmark, "
-        f"or let a camera that is tied see a marker on it"
+        f"{bodies} not tied to the datum: no camera on them ({_listed(cameras)}) saw a benchmark "
+        f"({_listed(surveyed)}), no camera that is tied saw a marker on them ({_listed(markers)}); let a camera "
+        f"on one of them see a benchmark, or let a camera that is tied see a marker on one of them"
     )
 
 
@@ -215,9 +232,8 @@ def _unseen(network: Network, pairs: Counter) -> list[str]:
     sentences = []
     for k, marker in enumerate(network.markers):
         if k not in seen_markers:
-            what = "benchmark" if marker.benchmark else f"marker on '{marker.body}',"
             sentences.append(
-                f"{what} '{marker.name}' was never seen: check its tag ids and family, and that a camera looks at it"
+                f"benchmark '{marker.name}' was never seen: check its tag ids and family, and that a camera looks at it"
                 if marker.benchmark
                 else f"marker '{marker.name}' on '{marker.body}' was never seen by any camera"
             )

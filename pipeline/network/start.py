@@ -18,8 +18,14 @@ from pipeline.network.model import Network
 
 CORNER_CAP_PX = 20.0
 """A corner further off than this tells nothing about the branch, only that one of the two is wrong."""
-BRANCH_SIGMA_PX = 1.0
-"""Corner noise plus what uncertain mounts do to a reprojection that assumes them exact."""
+OWN_SIGMA_PX = 0.3
+"""A picture against its own pose: corner noise, and what uncertain intrinsics do."""
+OTHER_SIGMA_PX = 3.0
+"""A picture against the pose from another: a milliradian of an uncertain mount is a pixel and more. With one sigma for
+both, two cameras whose mounts were off by 0.05 deg agreed on a flipped marker."""
+AGREE_RAD, DISAGREE_CAP = 0.1, 50.0
+"""Two pictures of one body agree on its rotation to about this; a picture that cannot be brought to agree counts no
+more than the cap."""
 TURN_RAD, TURN_RAD_S = 0.05, 0.5
 SHIFT_M, SHIFT_M_S = 0.1, 2.0
 """Between two pictures dt apart a body turns and moves by about the first plus the second times dt. The two branches
@@ -52,6 +58,7 @@ class _View:
     seen: np.ndarray  # (F, m)
     focal_px: float
     poses: np.ndarray  # (F, 2, 4, 4) T_camera_marker
+    misfit: np.ndarray  # (F, 2) sum of its squared residuals, px²
 
 
 def start(network: Network, tie: Tie, epochs: Epochs) -> Start:
@@ -149,6 +156,7 @@ class _Search:
         views = [v for v in self.views if [k for k in map(_key, v.path) if k in self.unknown] == [key]]
         knots = np.unique(np.concatenate([v.epoch for v in views]))
         candidates = np.full((len(knots), 2 * len(views), 4, 4), np.nan)
+        misfit = np.full((len(knots), 2 * len(views)), np.nan)
         around = []
         for j, view in enumerate(views):
             rows = np.searchsorted(knots, view.epoch)
@@ -159,13 +167,15 @@ class _Search:
             if key[0] == "joint":
                 E = fr.turn(np.arctan2(E[..., 1, 0] - E[..., 0, 1], E[..., 0, 0] + E[..., 1, 1]))
             candidates[rows, 2 * j : 2 * j + 2] = E
-        cost, median_px = _score(candidates, views, around)
+            misfit[rows, 2 * j : 2 * j + 2] = view.misfit
+        cost, middle_px = _score(candidates, views, around)
+        cost += _disagreement(candidates, misfit)
         if key[0] == "static":
             self.statics[key[1]] = _medoid(candidates, cost)
         else:
             chosen = _viterbi(candidates, cost, self.time_s[knots])
             rows = np.arange(len(knots))
-            good = np.isfinite(cost[rows, chosen]) & (median_px[rows, chosen] < LOST_PX)
+            good = np.isfinite(cost[rows, chosen]) & (middle_px[rows, chosen] < LOST_PX)
             if np.sum(good) < 0.5 * len(knots):
                 good = np.isfinite(cost[rows, chosen])
             E = candidates[rows, chosen][good]
@@ -256,26 +266,54 @@ def _views(network: Network, tie: Tie, epochs: Epochs) -> Iterator[_View]:
             poses = planar.both_poses(flat, xy, visible.astype(float))
             poses[~(poses[..., 2, 3] > 0)] = np.nan  # behind the camera
             path = tie.frames.path(fr.camera_frame(camera.name), fr.marker_frame(marker.name))
-            yield _View(path, frames, p, xy, visible, float(np.mean(intrinsics[:2])), poses)
+            focal_px = float(np.mean(intrinsics[:2]))
+            off = np.where(visible[:, None], _off(poses, p, xy, focal_px), 0.0)
+            yield _View(path, frames, p, xy, visible, focal_px, poses, np.sum(off**2, axis=-1))
+
+
+def _off(T_camera_marker, p_marker, xy, focal_px):
+    """Capped distances of corners, px, for candidate poses (F, K, 4, 4) of points (m, 3): (F, K, m)."""
+    T = T_camera_marker
+    p = np.einsum("fkij,mj->fkmi", T[..., :3, :3], p_marker) + T[..., None, :3, 3]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        off = focal_px * np.hypot(*np.moveaxis(p[..., :2] / p[..., 2:] - xy[:, None], -1, 0))
+    off = np.where(p[..., 2] > 0, np.minimum(off, CORNER_CAP_PX), CORNER_CAP_PX)
+    return np.where(np.isnan(T[..., :1, 0]), np.nan, off)
+
+
+def _disagreement(candidates, misfit):
+    """How badly each candidate goes with the pictures of its epoch: its own by reprojection, the others by rotation.
+
+    Another picture chooses the branch that suits the candidate, at the price of that branch's own reprojection. So
+    uncertain mounts, which shift whole pictures by pixels, do not decide between branches; corners do.
+    """
+    n, k = misfit.shape
+    R = candidates[..., :3, :3]
+    cosine = 0.5 * (np.einsum("naij,nbij->nab", R, R) - 1)
+    angle = np.arccos(np.clip(cosine, -1, 1))
+    own = 0.5 * misfit / OWN_SIGMA_PX**2
+    price = np.where(np.isnan(own)[:, None], np.inf, own[:, None] + 0.5 * (angle / AGREE_RAD) ** 2)
+    price = np.nan_to_num(price, nan=np.inf).reshape(n, k, k // 2, 2)
+    best = np.min(np.where(np.isnan(own), np.inf, own).reshape(n, k // 2, 2), axis=-1)[:, None]
+    total = np.minimum(price.min(axis=-1), best + DISAGREE_CAP)
+    for j in range(k):  # of its own picture a candidate is one branch and cannot choose
+        total[:, j, j // 2] = np.minimum(own[:, j], best[:, 0, j // 2] + DISAGREE_CAP)
+    return np.sum(np.where(np.isfinite(total), total, 0.0), axis=-1)
 
 
 def _score(candidates, views, around):
-    """Reprojection of every candidate in all pictures of its epoch: whitened cost, and the median corner in px."""
+    """Reprojection of every candidate in all pictures of its epoch: whitened cost, and the mean corner in px."""
     total = np.zeros(candidates.shape[:2])
     worst = np.zeros(candidates.shape[:2])
     for view, (rows, before, after, sign) in zip(views, around, strict=True):
         E = candidates[rows]
         T = before[:, None] @ (se3.inverse(E) if sign < 0 else E) @ after[:, None]
-        p = np.einsum("fkij,mj->fkmi", T[..., :3, :3], view.p_marker) + T[..., None, :3, 3]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            off = view.focal_px * np.hypot(*np.moveaxis(p[..., :2] / p[..., 2:] - view.xy[:, None], -1, 0))
-        off = np.where(p[..., 2] > 0, off, CORNER_CAP_PX)
-        off = np.where(np.isnan(T[..., :1, 0]), np.nan, np.minimum(off, CORNER_CAP_PX))
+        off = _off(T, view.p_marker, view.xy, view.focal_px)
         total[rows] += np.sum(np.where(view.seen[:, None], off, 0.0) ** 2, axis=-1)
         middle = np.sum(np.where(view.seen[:, None], off, 0.0), axis=-1) / view.seen.sum(-1)[:, None]
         worst[rows] = np.maximum(worst[rows], middle)
     bad = np.isnan(candidates[..., 0, 0])
-    return np.where(bad, np.inf, 0.5 * total / BRANCH_SIGMA_PX**2), np.where(bad, np.inf, worst)
+    return np.where(bad, np.inf, 0.5 * total / OTHER_SIGMA_PX**2), np.where(bad, np.inf, worst)
 
 
 def _viterbi(candidates, cost, time_s):

@@ -266,6 +266,10 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
         "tool": T_bucket @ by_name["cutting edge mount"],
     }
 
+    for name, body in network.bodies.items():
+        if body.kind == "static":
+            T_world[name] = np.broadcast_to(by_name[f"body {name} pose"], (len(t), 4, 4))
+
     readings = {}
     if network.sensors:
         rows = np.searchsorted(time_ns, reading_ns)

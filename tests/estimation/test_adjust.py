@@ -282,7 +282,7 @@ def test_a_stick_that_nobody_sees_is_named():
     boards_only = seen.take(
         np.array([drawn.network.markers[m].benchmark for m in drawn.network.tag_marker])[seen.tag]
     )
-    with pytest.raises(NetworkError, match=r"'stick' is not tied to the datum.*let a camera"):
+    with pytest.raises(NetworkError, match=r"body 'stick' is not tied to the datum.*let a camera"):
         adjust(drawn.network, boards_only, drawn.readings)
 
 
