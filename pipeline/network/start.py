@@ -200,7 +200,7 @@ class _Search:
             angle = np.unwrap(np.arctan2(E[:, 1, 0], E[:, 0, 0]))
             self.pose[key[1]] = np.interp(self.time_s, t, angle)
             if len(t) > 1:
-                self.rate[key[1]] = np.interp(self.time_s, t, np.gradient(angle, t))
+                self.rate[key[1]] = np.interp(self.time_s, t, np.gradient(angle, t), left=0.0, right=0.0)
             return
         if len(t) == 1:
             self.pose[key[1]] = np.broadcast_to(E[0], (len(self.time_s), 4, 4)).copy()
@@ -208,7 +208,10 @@ class _Search:
         self.pose[key[1]] = geodesic(t, E, self.time_s)
         low, high = np.maximum(np.arange(len(t)) - 1, 0), np.minimum(np.arange(len(t)) + 1, len(t) - 1)
         rate = se3.local(E[low], E[high]) / (t[high] - t[low])[:, None]
-        self.rate[key[1]] = np.stack([np.interp(self.time_s, t, rate[:, i]) for i in range(6)], axis=-1)
+        # Before the first and after the last picture nobody knows of a motion: at rest.
+        self.rate[key[1]] = np.stack(
+            [np.interp(self.time_s, t, rate[:, i], left=0.0, right=0.0) for i in range(6)], axis=-1
+        )
 
 
 def geodesic(t, T, at):
@@ -288,17 +291,17 @@ def _disagreement(candidates, misfit):
     uncertain mounts, which shift whole pictures by pixels, do not decide between branches; corners do.
     """
     n, k = misfit.shape
-    R = candidates[..., :3, :3]
+    R = np.where(np.isfinite(candidates), candidates, np.eye(4))[..., :3, :3]
     cosine = 0.5 * (np.einsum("naij,nbij->nab", R, R) - 1)
     angle = np.arccos(np.clip(cosine, -1, 1))
     own = 0.5 * misfit / OWN_SIGMA_PX**2
     price = np.where(np.isnan(own)[:, None], np.inf, own[:, None] + 0.5 * (angle / AGREE_RAD) ** 2)
-    price = np.nan_to_num(price, nan=np.inf).reshape(n, k, k // 2, 2)
+    price = np.where(np.isnan(price), np.inf, price).reshape(n, k, k // 2, 2)
     best = np.min(np.where(np.isnan(own), np.inf, own).reshape(n, k // 2, 2), axis=-1)[:, None]
     total = np.minimum(price.min(axis=-1), best + DISAGREE_CAP)
     for j in range(k):  # of its own picture a candidate is one branch and cannot choose
         total[:, j, j // 2] = np.minimum(own[:, j], best[:, 0, j // 2] + DISAGREE_CAP)
-    return np.sum(np.where(np.isfinite(total), total, 0.0), axis=-1)
+    return np.sum(np.where(np.isfinite(total), total, 0.0), axis=-1)  # inf: that picture is of another epoch
 
 
 def _score(candidates, views, around):
@@ -320,9 +323,10 @@ def _viterbi(candidates, cost, time_s):
     """The cheapest way through the candidates: reprojection, plus how far a body turns and moves in the time."""
     best = np.min(cost, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        unary = np.minimum(np.nan_to_num(cost - best, nan=STEP_CAP, posinf=np.inf), 10 * STEP_CAP)
-    unary[~np.isfinite(cost)] = 1e6
-    rows, (n, k) = np.nan_to_num(candidates), candidates.shape[:2]
+        unary = np.where(np.isfinite(cost), np.minimum(cost - best, 10 * STEP_CAP), 1e6)
+    # What is no candidate is priced out above; as the identity it cannot overflow here.
+    rows = np.where(np.isfinite(candidates), candidates, np.eye(4))
+    n, k = candidates.shape[:2]
     value, back = unary[0], np.zeros((n, k), dtype=np.int64)
     if n > 1:
         R, t = rows[..., :3, :3], rows[..., :3, 3]
