@@ -91,7 +91,12 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
     sensor_fits = diagnostics.fit_sensors(problem, values, weights, found)
     table = diagnostics.corner_table(problem, corner_fits)
     statics = diagnostics.static_results(problem, values, found)
-    warnings = [*problem.tie.warnings, *diagnostics.moved_statics(statics)]
+    motion = diagnostics.motion_fit(problem, values)
+    warnings = [
+        *problem.tie.warnings,
+        *diagnostics.moved_statics(statics),
+        *diagnostics.stiff_motion(motion),
+    ]
     if not optimum.converged:
         warnings.append(
             f"the adjustment stopped after {optimum.iterations} iterations with a last step of "
@@ -122,7 +127,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
             s.sensor.name: diagnostics.variance_component([f], settings.huber)
             for s, f in zip(problem.sensors, sensor_fits, strict=True)
         },
-        "motion": diagnostics.motion_fit(problem, values),
+        "motion": motion,
         "pixels": diagnostics.pixel_rms(problem.network, table),
         "dropped": problem.epochs.dropped,
         "error_budget": budget,

@@ -20,6 +20,11 @@ MOVED_SIGMAS = 3.5
 """A static further off its file value than this is named: of 75 components one in thirty logs does so by chance."""
 
 
+STIFF = 1.5
+"""Mean square of the whitened motion residuals from which a density is called too small. With a bucket's density a
+hundred times too small it was 4, and the slope of its sensor's curve left its file value by 31 sigma to move less."""
+
+
 @dataclass(frozen=True, eq=False)
 class Fit:
     """One group of measurements after the adjustment."""
@@ -127,6 +132,20 @@ def motion_fit(problem: Problem, values: Values) -> dict:
                 "rotation": round(float(by_axis[1]), 4),
             }
     return out
+
+
+def stiff_motion(fit: dict) -> list[str]:
+    """A sentence for each body that moved more than its motion prior admits."""
+    sentences = []
+    for body, parts in fit.items():
+        for part, value in parts.items():
+            if value > STIFF:
+                sentences.append(
+                    f"body '{body}' accelerated more than motion.{body}.{part} admits (mean square {value:.1f}, at "
+                    f"most 1 if it is right): its states are smoothed and its sigmas are too small; multiply the value "
+                    f"by about {max(2.0, 2 * value):.0f}"
+                )
+    return sentences
 
 
 def variance_component(fits: list[Fit], k: float) -> dict:

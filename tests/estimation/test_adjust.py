@@ -293,3 +293,15 @@ def test_the_same_log_twice_gives_the_same_bytes():
     for a, b in zip(first.states, second.states, strict=True):
         assert a.T_world_body.tobytes() == b.T_world_body.tobytes()
         assert a.common.tobytes() == b.common.tobytes()
+
+
+def test_a_motion_prior_that_is_too_stiff_is_named():
+    machine = copy.deepcopy(MACHINE)
+    machine["motion"]["bucket"]["rotation"] = 0.1
+    drawn = draw(17, Options(epochs=10, machine=machine))
+    bodies = dict(drawn.network.bodies)
+    bodies["bucket"] = replace(bodies["bucket"], motion=(1.0, 1e-3))
+    stiff = adjust(replace(drawn.network, bodies=bodies), drawn.observations, drawn.readings)
+    assert any("motion.bucket.rotation" in w for w in stiff.warnings)
+    right = adjust(drawn.network, drawn.observations, drawn.readings)
+    assert not any("motion." in w for w in right.warnings)
