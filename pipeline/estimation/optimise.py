@@ -15,6 +15,7 @@ from pipeline.estimation.problem import (
     keep_all,
     lengths,
     linearise,
+    unchecked_statics,
 )
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.estimation.values import Values
@@ -23,8 +24,8 @@ STRETCH = 64
 """Epochs that are damped together: some ten seconds of frames. Inside a gap that holds a whole swing the model is not
 linear over a step; a global damping would let that one gap throttle the whole shift."""
 DAMPING_FIRST, DAMPING_UP, DAMPING_DOWN, DAMPING_NONE = 1e-6, 30.0, 0.03, 1e-8
-"""Shares of the diagonal. Nearly all of it is motion prior, which neighbouring epochs cancel: what holds a gap as a whole is
-a millionth of it."""
+"""Shares of the diagonal. Nearly all of it is motion prior, which neighbouring epochs cancel: what holds a gap as a
+whole is a millionth of it."""
 STEP_SIGMAS = 0.05
 """Converged when no unknown moves by more of its posterior sigma. ``-g' dx`` is the squared length of the whole step
 in that measure, so it bounds every single one."""
@@ -36,6 +37,8 @@ GATE = 3.0
 becomes zero, and the rest is adjusted again. Gated from the start, a bad start would throw away good corners."""
 GATE_ROUNDS = 4
 TRIES = 14
+HOLD = 1e12
+"""Information that keeps an unchecked static where it is during the steps; a static's prior is 1. Not for covariances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,10 +114,12 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
             "the starting values of the adjustment cannot be evaluated; look at the detections of the first "
             "epochs and at the mounts in machine.toml"
         )
+    held = unchecked_statics(problem)
     sigmas, converged, used = np.inf, False, 0
     while used < limit and not converged:
         used += 1
         chains, C, g_z = linearise(problem, values, weights, newton=used > IRLS_STEPS)
+        C[held, held] += HOLD
         shorten = 1.0
         for attempt in range(TRIES):
             step = _solve(chains, C, g_z, damping[stretch])
