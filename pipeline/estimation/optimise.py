@@ -38,7 +38,7 @@ becomes zero, and the rest is adjusted again. Gated from the start, a bad start 
 GATE_ROUNDS = 4
 TRIES = 14
 HOLD = 1e12
-"""Information that keeps an unchecked static where it is during the steps; a static's prior is 1. Not for covariances."""
+"""Information that keeps an unchecked static where it is during the steps; a prior is 1. Not for covariances."""
 
 
 @dataclass(frozen=True, eq=False)
