@@ -150,7 +150,7 @@ def unchecked_statics(problem: Problem) -> np.ndarray:
 
     Nothing measured speaks of them, yet the motion prior does: less motion costs it less, so it shrinks the gain of the
     curve, by 1.9 sigma on a log of 3,600 readings (the more readings, the further). They stay at the file's
-    values, and their covariance goes into the common part as it stands there.
+    values; in the covariance pass they are unknowns with their prior like all others, so it goes into the common part.
 
     Returns
     -------
