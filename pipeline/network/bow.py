@@ -2,8 +2,8 @@
 
 The tag detector fits a straight line to each side of a tag and takes their crossings as its corners. Through a lens
 with distortion a side is bowed; its line lies beside the ends by two thirds of the sagitta or so, always to the same
-side at the same place of the picture. With k1 = -0.14 that is 0.015 px, small against the noise of one corner, and
-15 mm at the cutting edge, because it never averages out. The bow follows from the intrinsics, so it is taken off.
+side at the same place of the picture. With k1 = -0.14 that is 0.015 px: small against the noise of one corner, but it
+is the same in every frame and never averages out. The bow follows from the intrinsics, so it is taken off.
 """
 
 from __future__ import annotations
