@@ -152,7 +152,7 @@ def main() -> int:
         f"RMSE/sigma {worst_ratio:.2f} (3), coverage {coverage:.1%} (90 to 99 %), "
         f"worst station {1e3 * worst_station:.1f} mm (25.4)"
     )
-    keep_result("main_job", scores, line)
+    keep_result("main-job", scores, line)
     print(line)
     return 0 if met else 1
 
