@@ -161,7 +161,8 @@ class EstimationSettings(Section):
 
 class SurveySettings(Section):
     cell_m: Annotated[float, Field(gt=0, le=1)] = 0.05
-    station_step_m: Annotated[float, Field(gt=0, le=100)] = 0.5
+    station_step_m: Annotated[float, Field(gt=0, le=100)] | None = None
+    """Distance of the stations; left out, 0.5 m, or 2 ft on a grid in feet, so that stations are round numbers."""
     surface: Literal["lowest", "last"] = "lowest"
     """The lower envelope of the sweep for digging; the last pass for placed material."""
 
@@ -213,6 +214,11 @@ class Site(Section):
                     "easting, northing, elevation, the unit, and the origin"
                 )
         return self
+
+    @property
+    def station_step_m(self) -> float:
+        """Distance of the stations, metres."""
+        return self.survey.station_step_m or (0.5 if self.grid.unit == "m" else 2 * self.grid.metres_per_unit)
 
     def benchmark_pose(self, name: str) -> Pose | None:
         """Surveyed pose of a benchmark in the world (metres), or None where corners were surveyed."""

@@ -25,6 +25,9 @@ from pipeline.network.epochs import Epochs, epochs_of
 from pipeline.network.model import SOURCES, Network, Observations, Readings
 from pipeline.network.start import start as start_values
 
+LOST_SIGMAS = 10.0
+"""An adjustment that stops while it still moves by more than this has no covariances and so no verdicts."""
+
 
 def adjust(
     network: Network,
@@ -61,6 +64,12 @@ def adjust(
     epochs = epochs_of(network, observations.take(tied.used), readings)
     problem = problem_of_log(network, tied, epochs)
     optimum = optimise(problem, settings.huber, settings.max_iterations)
+    if not optimum.converged and optimum.last_step_sigmas > LOST_SIGMAS:
+        raise EstimationError(
+            f"the adjustment found no answer: after {optimum.iterations} iterations it still moves by "
+            f"{optimum.last_step_sigmas:.2g} sigma; something in machine.toml or site.toml contradicts the log, "
+            "most often the topic, field or curve of a sensor, or a tag's size or place"
+        )
     return solution_of(problem, optimum, settings)
 
 

@@ -170,6 +170,8 @@ def _stamp_ns(values: Any) -> int:
     if stamp is None:
         return 0
     if not isinstance(stamp, dict):
+        if not -(2**33) < stamp.seconds < 2**33:
+            raise MalformedMessage("timestamp is out of range")
         return stamp.seconds * SECOND + stamp.nanos
     sec, nsec = stamp.get("sec", 0), stamp.get("nsec", 0)
     if type(sec) is not int or type(nsec) is not int or not -(2**33) < sec < 2**33 or not 0 <= nsec < 2**32:

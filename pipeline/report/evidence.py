@@ -190,7 +190,7 @@ def quality(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     length, weight = residuals["normalised"], residuals["weight"]
     figures += [
         ("corners", number(len(length))),
-        ("rms", number(float(np.sqrt(np.mean(length**2) / 2)), "", 2)),
+        ("rms", number(_root_mean_square(length[weight > 0]), "", 2)),
         ("beyond", number(100.0 * float(np.mean(length > FAR)), "%", 1)),
         ("downweighted", number(100.0 * float(np.mean(weight < 0.5)), "%", 1)),
     ]
@@ -233,17 +233,25 @@ def quality(inputs: ReportInputs, words: Words) -> dict[str, Any]:
 
 
 def _marker_row(residuals: Table, own: np.ndarray, marker: str, camera: str) -> dict[str, Any]:
-    square = residuals["residual_u"][own] ** 2 + residuals["residual_v"][own] ** 2
+    used = (
+        residuals["weight"][own] > 0
+    )  # what was rejected as gross is counted, and tells nothing about the rest
     length = residuals["normalised"][own]
+    pixels = np.hypot(residuals["residual_u"][own], residuals["residual_v"][own])
     return {
         "marker": marker,
         "camera": camera,
         "corners": int(own.sum()),
-        "rms_px": float(np.sqrt(square.mean() / 2)),
-        "mean_square": float(np.sqrt(np.mean(length**2) / 2)),
+        "rms_px": _root_mean_square(pixels[used]),
+        "mean_square": _root_mean_square(length[used]),
         "beyond": 100.0 * float(np.mean(length > FAR)),
         "downweighted": 100.0 * float(np.mean(residuals["weight"][own] < 0.5)),
     }
+
+
+def _root_mean_square(length: np.ndarray) -> float:
+    """Per component of two, of lengths; nan where there are none."""
+    return float(np.sqrt(np.mean(length**2) / 2)) if len(length) else float("nan")
 
 
 def _global_test(inputs: ReportInputs, words: Words) -> str:

@@ -13,10 +13,12 @@ from pipeline.report.units import MISSING, Units, text_of
 from pipeline.report.words import Words
 
 
-def deviation_text(metres: float | None, units: Units, signed: bool = True) -> str:
-    """A deviation with its unit, for a sentence."""
+def deviation_text(metres: float | None, units: Units, signed: bool = True, fine: bool = False) -> str:
+    """A deviation with its unit, for a sentence; `fine` where a limit of 25.4 mm must not be printed as 25."""
     value = None if metres is None else float(units.to_deviation(metres))
-    return f"{text_of(value, units.deviation_digits, signed)} {units.deviation}"
+    whole = value is None or abs(value - round(value, units.deviation_digits)) < 1e-6
+    digits = units.fine_digits if fine and not whole else units.deviation_digits
+    return f"{text_of(value, digits, signed)} {units.deviation}"
 
 
 def station_text(metres: float, units: Units) -> str:
@@ -81,8 +83,8 @@ def surveyed(inputs: ReportInputs, units: Units, words: Words) -> list[dict[str,
             "tolerance",
             words(
                 "surveyed.tolerance_text",
-                high=deviation_text(tolerance.high_mm / 1000, units),
-                low=deviation_text(-tolerance.low_mm / 1000, units),
+                high=deviation_text(tolerance.high_mm / 1000, units, fine=True),
+                low=deviation_text(-tolerance.low_mm / 1000, units, fine=True),
                 k=f"{tolerance.coverage_factor:g}",
             ),
         ),
@@ -154,8 +156,8 @@ def _of_stations(stations, inputs: ReportInputs, units: Units, words: Words):
     note = words(
         "summary.uncertainty_note",
         k=f"{tolerance.coverage_factor:g}",
-        high=deviation_text(tolerance.high_mm / 1000, units, signed=False),
-        low=deviation_text(tolerance.low_mm / 1000, units, signed=False),
+        high=deviation_text(tolerance.high_mm / 1000, units, signed=False, fine=True),
+        low=deviation_text(tolerance.low_mm / 1000, units, signed=False, fine=True),
     )
     median = float(np.median(stations["expanded_uncertainty"][dug]))
     entries.append(("uncertainty", deviation_number(median, units, signed=False, fine=True), note))

@@ -264,7 +264,7 @@ def cells_table(inputs: ReportInputs, grid: Grid, units: Units, words: Words) ->
         column("mean", words("columns.deviation"), units.deviation, units.deviation_digits, signed=True),
         column("high", words("columns.high"), units.deviation, units.deviation_digits, signed=True),
     ]
-    step = inputs.site.survey.station_step_m
+    step = inputs.site.station_step_m
     block = np.floor((grid.station - grid.station[0]) / step + 1e-6).astype(int)
     rows = []
     for number_ in np.unique(block):

@@ -175,7 +175,10 @@ def _shots(
         **marks,
     )
     compared = np.asarray(checks["result"])[on] == "compared"
-    level = np.interp(station, stations["station"], stations["design_h"], left=np.nan, right=np.nan)
+    if design is not None:
+        level = design.elevation(station, np.asarray(checks["offset"], float)[on])
+    else:
+        level = np.interp(station, stations["station"], stations["design_h"], left=np.nan, right=np.nan)
     below.errorbar(
         units.to_length(station[compared]),
         units.to_deviation((h - level)[compared]),

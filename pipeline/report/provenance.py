@@ -19,8 +19,8 @@ def method(inputs: ReportInputs, units: Units, words: Words) -> list[str]:
     cell = deviation_text(site.survey.cell_m, units, signed=False)
     k = f"{tolerance.coverage_factor:g}"
     low, high = (
-        deviation_text(tolerance.low_mm / 1000, units, False),
-        deviation_text(tolerance.high_mm / 1000, units, False),
+        deviation_text(tolerance.low_mm / 1000, units, False, fine=True),
+        deviation_text(tolerance.high_mm / 1000, units, False, fine=True),
     )
     # What this run did, in the words of the stage that did it; else what the settings say.
     rules = inputs.survey.get("rules") or {}

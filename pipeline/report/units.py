@@ -56,7 +56,7 @@ def units_of(grid_unit: str, metres_per_unit: float) -> Units:
         return Units("m", 1.0, 3, 2, "mm", 1000.0, 0, 1)
     name = {"us_survey_foot": "US ft"}.get(grid_unit, "ft")
     per_metre = 1.0 / metres_per_unit
-    return Units(name, per_metre, 3, 2, name, per_metre, 2, 3)
+    return Units(name, per_metre, 3, 2, name, per_metre, 3, 3)
 
 
 def text_of(value: float | int | None, digits: int, signed: bool = False, grouped: bool = True) -> str:

@@ -14,6 +14,7 @@ from pipeline.estimation.table import (
     observations_of,
     readings_of,
 )
+from pipeline.logs.clock import EARLIEST_NS
 from pipeline.network import network_of
 from pipeline.stages.job import Counts, Job, Progress
 
@@ -23,8 +24,7 @@ logger = logging.getLogger(__name__)
 def run(job: Job, progress: Progress) -> Counts:
     """Write the adjusted states, statics and residuals. Raises NetworkError, EstimationError, ConfigError."""
     started = time.monotonic()
-    date = datetime.datetime.fromtimestamp(job.read_json("log.json")["start_ns"] / 1e9, datetime.UTC).date()
-    network = network_of(job.calibrated_machine(), job.site, date)
+    network = network_of(job.calibrated_machine(), job.site, _day_of(job.read_json("log.json")["start_ns"]))
     cameras = [name for name in job.parts("detections") if name in {c.name for c in network.cameras}]
     observations = observations_of(
         network, {name: job.read_table("detections", part=name) for name in cameras}
@@ -62,3 +62,10 @@ def run(job: Job, progress: Progress) -> Counts:
         "iterations": figures["iterations"],
         "sigma0": figures["sigma0"],
     }
+
+
+def _day_of(start_ns: int) -> datetime.date | None:
+    """Day of the log, by which tooth wear is chosen; None, the latest wear, where the clock was never set."""
+    if start_ns < EARLIEST_NS:
+        return None
+    return datetime.datetime.fromtimestamp(start_ns / 1e9, datetime.UTC).date()

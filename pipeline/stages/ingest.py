@@ -275,7 +275,7 @@ def _check_clocks(sources: dict[str, Columns], log_name: str, progress: Progress
         if middles[name] < EARLIEST_NS:
             progress.warn(
                 f"the clock of '{name}' was never set: its stamps say {_date(middles[name])}; "
-                "positions are not affected, dates are"
+                "dates are wrong, and of several tooth wears the latest is taken"
             )
     if middles:
         low, high = min(middles, key=middles.__getitem__), max(middles, key=middles.__getitem__)

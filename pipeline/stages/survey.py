@@ -91,7 +91,7 @@ def run(job: Job, progress: Progress) -> Counts:
     band = ToleranceBand(
         site.tolerance.high_mm / 1000, site.tolerance.low_mm / 1000, site.tolerance.coverage_factor
     )
-    step_m = site.survey.station_step_m
+    step_m = site.station_step_m
     where = stations_along(design, alignment.start_station, alignment.end_station, step_m)
     stations = judge(built, design, where, step_m, band)
     verdict = job_verdict(stations)

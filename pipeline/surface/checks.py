@@ -92,8 +92,8 @@ def compare(shots: Shots, built: AsBuilt, alignment: Alignment, sigma_ts_m: floa
             continue
         row = int(np.floor((station[i] - grid.first_station) / grid.cell_m))
         column = int(np.floor((offset[i] - grid.first_offset) / grid.cell_m))
-        if not (-reach <= row < grid.rows + reach and -reach <= column < grid.columns + reach):
-            continue
+        if not (0 <= row < grid.rows and 0 <= column < grid.columns and built.floor[row, column]):
+            continue  # beside the floor: the slope, or a control point next to the trench
         block = (
             slice(max(row - reach, 0), max(row + reach + 1, 0)),
             slice(max(column - reach, 0), max(column + reach + 1, 0)),
@@ -107,7 +107,7 @@ def compare(shots: Shots, built: AsBuilt, alignment: Alignment, sigma_ts_m: floa
         result[i] = COMPARED
         h = built.h[block][near]
         # A plane through the designed elevations of the cells carries their mean over to the shot.
-        slope = _slope(built.design_h[block], grid.cell_m)
+        slope = _slope(np.where(built.floor[block], built.design_h[block], np.nan), grid.cell_m)
         toward = slope @ np.array([station[i] - along[near].mean(), offset[i] - across[near].mean()])
         as_built_h[i] = h.mean() + toward
         sigma[i] = np.hypot(built.sigma_own[block][near].mean(), built.sigma_common[block][near].mean())

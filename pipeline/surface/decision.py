@@ -207,6 +207,8 @@ def judge(
         state[i] = CUT if share >= rule.whole_share else PARTLY
         verdict[i], reason[i] = decide(deviation, uncertainty, band)
         if state[i] == PARTLY:
+            if verdict[i] == PASS:  # what was not cut may stand high: the cut part cannot speak for it
+                verdict[i], reason[i] = CANNOT_TELL, "the part that was cut is within tolerance"
             reason[i] += f"; {share:.0%} of the floor was cut"
         result["h"][i] = float(np.mean(built.h[rows][cut]))
         result["design_h"][i] = float(np.mean(built.design_h[rows][cut]))
@@ -225,19 +227,29 @@ def judge(
 
 
 def job_verdict(stations: Stations) -> JobVerdict:
-    """FAIL if any station fails, PASS if all that were reached pass, CANNOT TELL otherwise."""
+    """FAIL if any station fails, PASS if the trench passes from the first wholly cut station to the last.
+
+    Where the work began and ended a station is cut only in part; nobody holds that against the trench between. A
+    station in between that was not reached, or only in part, may hide anything: then the job cannot be told.
+    """
     counts = {v: int(np.count_nonzero(stations.verdict == v)) for v in (PASS, FAIL, CANNOT_TELL, NOT_REACHED)}
     reached = len(stations.verdict) - counts[NOT_REACHED]
     if reached == 0:
         return JobVerdict(CANNOT_TELL, "No station was reached: there is nothing to judge.", counts)
+    whole = np.flatnonzero(stations.state == CUT)
+    between = stations.verdict[whole[0] : whole[-1] + 1] if len(whole) else np.array([], object)
+    ends = reached - int(np.count_nonzero(between != NOT_REACHED))
     if counts[FAIL]:
         verdict = FAIL
         sentence = f"{counts[FAIL]} of {reached} reached stations are out of tolerance"
-    elif counts[PASS] == reached:
-        verdict, sentence = PASS, f"All {reached} reached stations are within tolerance"
+    elif len(between) and np.all(between == PASS):
+        verdict, sentence = PASS, f"All {len(between)} stations that were wholly cut are within tolerance"
+        sentence += f"; {ends} at the ends were cut in part only" if ends else ""
     else:
         verdict = CANNOT_TELL
         sentence = f"{counts[CANNOT_TELL]} of {reached} reached stations cannot be told, none fails"
+        skipped = int(np.count_nonzero(between == NOT_REACHED))
+        sentence += f"; {skipped} between them were not cut" if skipped else ""
     if counts[NOT_REACHED]:
         sentence += f"; {counts[NOT_REACHED]} of {len(stations.verdict)} stations were not reached"
     return JobVerdict(verdict, sentence + ".", counts)

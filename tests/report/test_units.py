@@ -15,9 +15,9 @@ def test_a_metric_site_reads_metres_and_millimetres():
     "unit, metres, name, feet",
     [("international_foot", 0.3048, "ft", 1.0), ("us_survey_foot", 1200 / 3937, "US ft", 1.0)],
 )
-def test_a_site_in_feet_reads_feet_and_hundredths(unit, metres, name, feet):
+def test_a_site_in_feet_reads_feet_and_thousandths(unit, metres, name, feet):
     units = units_of(unit, metres)
-    assert (units.length, units.deviation, units.deviation_digits) == (name, name, 2)
+    assert (units.length, units.deviation, units.deviation_digits) == (name, name, 3)
     assert float(units.to_length(metres)) == pytest.approx(feet)
 
 
