@@ -187,6 +187,22 @@ def test_states_in_a_gap_are_bridged_with_wider_covariances():
     assert np.abs(z).max() < 4.5
 
 
+def test_an_edge_is_seen_only_where_every_link_to_the_datum_is():
+    """The cab sees its benchmarks all the time; for four seconds the stick's marker is hidden."""
+    drawn = draw(9, Options(epochs=60))
+    seen, t_ns = drawn.observations, drawn.frame_ns[0]
+    on_stick = (
+        np.array([m.name for m in drawn.network.markers])[drawn.network.tag_marker[seen.tag]] == "stick"
+    )
+    hidden = on_stick & (seen.time_ns >= t_ns + 4 * 10**9) & (seen.time_ns < t_ns + 8 * 10**9)
+    assert hidden.any()
+    solution = adjust(drawn.network, seen.take(~hidden), drawn.readings, EstimationSettings(max_gap_s=0.5))
+    tool, cab = solution.body("tool"), solution.body("cab")
+    t = (tool.time_ns - t_ns) * 1e-9
+    assert not tool.seen[(t > 4.4) & (t < 7.3)].any() and tool.seen[(t < 3.5) | (t > 8.5)].all()
+    assert cab.seen.all()
+
+
 @pytest.mark.parametrize("frames", [1, 2])
 def test_a_log_of_one_frame_has_an_answer(frames):
     drawn = draw(8, Options(epochs=frames, bucket_marker=True, potentiometer=False))

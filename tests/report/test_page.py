@@ -156,9 +156,8 @@ def test_stations_on_the_page_are_those_of_the_table(unit):
     rows = read.tables["stations"][1:] + read.tables.get("stations_beyond", [[]])[1:]
     stations = inputs.tables["stations"]
     assert len(rows) == len(stations["station"])
-    for row, station, verdict, deviation, h in zip(
-        rows, *(stations[k] for k in ("station", "verdict", "deviation", "h"))
-    ):
+    keys = ("station", "verdict", "deviation", "h", "expanded_uncertainty", "sigma_own", "sigma_common")
+    for row, station, verdict, deviation, h, u, own, common in zip(rows, *(stations[k] for k in keys)):
         assert as_float(row[0]) == pytest.approx(station * feet, abs=0.00501)
         assert row[1].endswith(verdict)
         if np.isnan(deviation):
@@ -166,7 +165,10 @@ def test_stations_on_the_page_are_those_of_the_table(unit):
             continue
         fall, limit = (1000, 0.501) if unit == "m" else (feet, 0.00501)
         assert as_float(row[2]) == pytest.approx(deviation * fall, abs=limit)
+        assert as_float(row[3]) == pytest.approx(u * fall, abs=limit)
         assert as_float(row[4]) == pytest.approx(h * feet, abs=0.000501)
+        assert as_float(row[6]) == pytest.approx(own * fall, abs=limit)
+        assert as_float(row[7]) == pytest.approx(common * fall, abs=limit)
 
 
 def test_the_statistics_are_those_of_the_survey_stage(page):
