@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
+import math
 import os
 import platform
 from pathlib import Path
@@ -31,4 +32,15 @@ def keep_result(name: str, rows: list[Any], line: str) -> None:
         "line": line,
         "rows": plain,
     }
-    (FOLDER / f"{name}.json").write_text(json.dumps(result, indent=1, default=float) + "\n", encoding="utf-8")
+    (FOLDER / f"{name}.json").write_text(
+        json.dumps(_plain(result), indent=1, default=float) + "\n", encoding="utf-8"
+    )
+
+
+def _plain(value: Any) -> Any:
+    """JSON has no NaN: null where there is no figure."""
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(part) for part in value]
+    return None if isinstance(value, float) and math.isnan(value) else value

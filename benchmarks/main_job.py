@@ -113,7 +113,11 @@ def draw(seed: int, folder: Path) -> Path:
     from pipeline.synthetic import command
 
     kept = sorted((folder / f"seed{seed}").glob("*.mcap"))  # the same seed gives the same bytes
-    return kept[0] if kept else command.make(folder / f"seed{seed}", "trench", minutes=3.0, size="1280", seed=seed)
+    return (
+        kept[0]
+        if kept
+        else command.make(folder / f"seed{seed}", "trench", minutes=3.0, size="1280", seed=seed)
+    )
 
 
 def main() -> int:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report import numbers
-from pipeline.report.facts import span_ns
+from pipeline.report.facts import edge_gaps, span_ns
 from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.numbers import column, number
 from pipeline.report.units import Units
@@ -46,16 +46,6 @@ class Timeline:
         return float((self.gaps_ns[:, 1] - self.gaps_ns[:, 0]).sum() / 1e9)
 
 
-def gaps_of(time_ns: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(g, 2) spans from the last observed instant to the next one, in nanoseconds."""
-    order = np.argsort(time_ns, kind="stable")
-    time_ns, seen = time_ns[order], seen[order].astype(bool)
-    change = np.diff(np.concatenate([[True], seen, [True]]).astype(np.int8))
-    starts, ends = np.flatnonzero(change == -1), np.flatnonzero(change == 1)
-    starts, ends = np.maximum(starts - 1, 0), np.minimum(ends, len(time_ns) - 1)
-    return np.stack([time_ns[starts], time_ns[ends]], axis=1).reshape(-1, 2)
-
-
 def timeline_of(inputs: ReportInputs, bins: int = MAX_BINS) -> Timeline | None:
     """The timeline in at most `bins` equal bins of at least a second, or None without frames."""
     frames, span = inputs.table("frames"), span_ns(inputs)
@@ -74,8 +64,7 @@ def timeline_of(inputs: ReportInputs, bins: int = MAX_BINS) -> Timeline | None:
     edge = inputs.table("cutting_edge")
     gaps = np.zeros((0, 2), np.int64)
     if edge is not None:
-        middle = edge["point"] == "middle"
-        gaps = gaps_of(edge["time_ns"][middle], edge["seen"][middle])
+        gaps = edge_gaps(inputs, edge, span)
     return Timeline(edges, seen_frames, accepted, gaps, start)
 
 

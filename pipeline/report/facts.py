@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.report import numbers
-from pipeline.report.inputs import ReportInputs
+from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.palette import verdict_style
 from pipeline.report.units import MISSING, Units, text_of
 from pipeline.report.words import Words
@@ -55,6 +55,38 @@ def span_ns(inputs: ReportInputs) -> tuple[int, int] | None:
         return int(start), int(end)
     frames = inputs.table("frames")
     return None if frames is None else (int(frames["time_ns"].min()), int(frames["time_ns"].max()))
+
+
+def edge_gaps(inputs: ReportInputs, edge: Table, span: tuple[int, int]) -> np.ndarray:
+    """(g, 2) spans of the log in which the cutting edge was not observed, nanoseconds."""
+    middle = edge["point"] == "middle"
+    longest_s = 2 * inputs.site.estimation.max_gap_s
+    return gaps_of(edge["time_ns"][middle], edge["seen"][middle], span, longest_s)
+
+
+def gaps_of(time_ns: np.ndarray, seen: np.ndarray, span: tuple[int, int], longest_s: float) -> np.ndarray:
+    """Spans between observed instants in which the edge was bridged, or in which there is nothing at all.
+
+    Parameters
+    ----------
+    time_ns, seen : (n,) arrays
+        Epochs of the cutting edge.
+    span : tuple of int
+        First and last instant of the log: what lies before the first epoch and after the last one counts too.
+    longest_s : float
+        Epochs further apart than this leave a gap even where both are observed.
+
+    Returns
+    -------
+    (g, 2) int array
+        Nanoseconds.
+    """
+    order = np.argsort(time_ns, kind="stable")
+    time_ns, seen = np.asarray(time_ns)[order], np.asarray(seen)[order].astype(bool)
+    knots = np.concatenate([[span[0]], time_ns[seen], [span[1]]]).astype(np.int64)
+    unseen = np.searchsorted(time_ns[~seen], knots)
+    gap = (np.diff(knots) > longest_s * 1e9) | (np.diff(unseen) > 0)
+    return np.stack([knots[:-1][gap], knots[1:][gap]], axis=1).reshape(-1, 2)
 
 
 def surveyed(inputs: ReportInputs, units: Units, words: Words) -> list[dict[str, str]]:
@@ -120,7 +152,9 @@ def summary(
         entries.append(("tracked", missing, why))
     else:
         note = words("summary.tracked_note", duration=numbers.duration_text((span[1] - span[0]) / 1e9))
-        entries.append(("tracked", numbers.number(100 * float(np.mean(edge["seen"])), "%", 1), note))
+        gaps = edge_gaps(inputs, edge, span)
+        share = 1 - float((gaps[:, 1] - gaps[:, 0]).sum()) / max(span[1] - span[0], 1)
+        entries.append(("tracked", numbers.number(100 * share, "%", 1), note))
     return [
         {"key": key, "label": words(f"summary.{key}"), "number": value, "note": note}
         for key, value, note in entries

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.report import palette, render
+from pipeline.report.facts import gaps_of
 from tests.report.conftest import HOSTILE, made_up_inputs
 from tests.report.pages import PageReader, as_float, at_path
 
@@ -231,6 +232,16 @@ def test_gaps_are_measured_from_the_last_seen_instant_to_the_next(page):
     # Frames 200 to 259 of five a second were not seen: from frame 199 to frame 260 are 12.2 s.
     assert page.content["coverage"]["bridged"]["value"] == pytest.approx(12.2)
     assert page.content["coverage"]["gap_count"]["value"] == 1
+
+
+def test_time_without_epochs_is_a_gap_wherever_it_lies():
+    second = 1_000_000_000
+    stamps = np.array([10, 11, 12, 62, 63, 64]) * second
+    gaps = gaps_of(stamps, np.ones(6, bool), (0, 70 * second), 1.5) / second
+    assert gaps.tolist() == [[0, 10], [12, 62], [64, 70]]
+    assert gaps_of(stamps[:3], np.array([1, 0, 1]), (10 * second, 12 * second), 5.0).tolist() == [
+        [10 * second, 12 * second]
+    ]
 
 
 def test_a_run_without_anything_says_what_is_missing_and_why():
