@@ -19,8 +19,6 @@ BESIDE_FLOOR_M = 0.3
 """Figures show this much beside the floor: what the edge touched further out says nothing on the trench."""
 MAX_REGULAR_SECTIONS = 9
 WORST_SECTIONS = 3
-INDICATIVE_BELOW = 30
-"""Fewer check shots than this carry no accuracy statement, only an indication."""
 
 
 def stations_table(stations: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:

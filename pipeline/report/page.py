@@ -24,6 +24,7 @@ from pipeline.report.provenance import method, provenance
 from pipeline.report.units import Units, text_of, units_of
 from pipeline.report.words import Words
 from pipeline.resources import template_folder
+from pipeline.surface.checks import ENOUGH
 
 FORMAT = "gradetrace/report/1"
 
@@ -83,7 +84,7 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "cross_sections": measured.sections_table(sections, units, words) if sections else None,
         "checks": None if checks is None else measured.checks_table(checks, units, words),
         "check_statistics": _labelled_statistics(statistics, words),
-        "indicative": statistics is not None and statistics["n"]["value"] < measured.INDICATIVE_BELOW,
+        "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
         "error_budget": evidence.error_budget(inputs, units, words),
         "coverage": evidence.coverage(inputs, words),
         "quality": evidence.quality(inputs, words),

@@ -136,8 +136,17 @@ def test_shots_where_nothing_was_cut_are_kept_and_not_compared(trench, built):
 
 def test_a_control_point_beside_the_floor_is_not_a_shot_of_the_floor(trench):
     wide = as_built(trench.passes([50.0], width=2.0), trench.alignment, trench.design, 0.05)
-    shots = shots_at(trench, [5.0, 5.0], [0.0, 0.8], 50.0)
-    assert compare(shots, wide, trench.alignment, 0.002).result.tolist() == [COMPARED, OUTSIDE_CUT]
+    shots = shots_at(trench, [5.0] * 3, [0.0, 0.8, 0.54], 50.0)  # the last within reach of cells of the floor
+    found = compare(shots, wide, trench.alignment, 0.002)
+    assert found.result.tolist() == [COMPARED, OUTSIDE_CUT, OUTSIDE_CUT]
+
+
+def test_the_slope_beside_the_floor_does_not_tilt_it_under_a_shot_at_its_edge(trench):
+    sloped = ProfileDesign("s", np.array([0.0, 10.0]), np.array([50.0, 50.0]), np.ones(2), np.full(2, 0.5))
+    surface = as_built(trench.passes([50.0]), trench.alignment, sloped, 0.05)
+    found = compare(shots_at(trench, [5.0, 5.0], [0.47, -0.49], 50.0), surface, trench.alignment, 0.002)
+    assert set(found.result) == {COMPARED}
+    assert np.allclose(found.difference, 0.0, rtol=0, atol=1e-6)
 
 
 def test_a_gradient_of_the_floor_does_not_enter_the_difference(trench):
