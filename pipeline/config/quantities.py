@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
 
 from pipeline.geometry import se3, so3
 
@@ -98,14 +98,45 @@ class Tag(Section):
         return np.array([self.x_m, self.y_m, 0.0]) + 0.5 * self.size_m * signs
 
 
-FAMILIES = {"tag36h11": 587, "tag25h9": 35, "tag16h5": 30, "tagStandard41h12": 2115}
-"""Family -> how many tags it has; their ids run from 0."""
+FAMILIES = {
+    "tag36h11": 587,
+    "tag25h9": 35,
+    "tag16h5": 30,
+    "tagStandard41h12": 2115,
+    **{f"DICT_{n}X{n}_{count}": count for n in (4, 5, 6, 7) for count in (50, 100, 250, 1000)},
+    "DICT_ARUCO_ORIGINAL": 1024,
+    "DICT_ARUCO_MIP_36h12": 250,
+}
+"""Family -> how many tags it has; their ids run from 0. AprilTag's by their own names, ArUco's by OpenCV's."""
+ALSO_CALLED = {
+    "DICT_APRILTAG_36h11": "tag36h11",
+    "DICT_APRILTAG_25h9": "tag25h9",
+    "DICT_APRILTAG_16h5": "tag16h5",
+}
+"""What OpenCV calls families that have a name here already; two names would make two families of one."""
+
+
+def _known_family(name: str) -> str:
+    if name not in FAMILIES:
+        same = {other.lower(): meant for other, meant in [*ALSO_CALLED.items(), *zip(FAMILIES, FAMILIES)]}
+        if meant := same.get(name.lower()):
+            raise ValueError(f"should be written {meant!r}")
+        apriltag = [family for family in FAMILIES if not family.startswith("DICT_")]
+        aruco = [family for family in FAMILIES if family.startswith("DICT_")]
+        raise ValueError(f"should be one of {', '.join(apriltag)}, or OpenCV's {', '.join(aruco)}")
+    return name
+
+
+Family = Annotated[
+    str, AfterValidator(_known_family), WithJsonSchema({"type": "string", "enum": list(FAMILIES)})
+]
+"""Which tags are printed on a marker."""
 
 
 class Print(Section):
     """What is printed on a marker: the family and the layout of its tags."""
 
-    family: Literal["tag36h11", "tag25h9", "tag16h5", "tagStandard41h12"]
+    family: Family
     tags: Annotated[tuple[Tag, ...], Field(min_length=1)]
 
     @model_validator(mode="after")

@@ -86,7 +86,21 @@ MACHINE_MISTAKES = [
         'family = "tag36h12"',
         'family = "tag36h12"',
         "markers.plate.family",
-        "found 'tag36h12'",
+        "should be one of tag36h11, tag25h9, tag16h5, tagStandard41h12, or OpenCV's DICT_4X4_50",
+    ),
+    (
+        'family = "tag36h11"',
+        'family = "DICT_APRILTAG_36h11"',
+        'family = "DICT_APRILTAG_36h11"',
+        "markers.plate.family",
+        "should be written 'tag36h11'",
+    ),
+    (
+        'family = "tag36h11"\ntags = [\n  { id = 1,',
+        'family = "DICT_4X4_50"\ntags = [\n  { id = 50,',
+        "[markers.plate]",
+        "markers.plate",
+        "DICT_4X4_50 has the ids 0 to 49, there is no tag 50 in it",
     ),
     (
         "id = 2, size_m = 0.2",
