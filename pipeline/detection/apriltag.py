@@ -1,91 +1,102 @@
 """Marker corners in a picture: AprilTag's search, brought into our conventions.
 
+It serves the families of AprilTag and, told of their codes by `aruco`, those of OpenCV's ArUco.
+
 AprilTag's C library puts the centre of the top-left pixel at (0.5, 0.5) and its corners run the other way round,
 from another corner. Both are put right here and nowhere else: 0.5 px is 2.9 mm at 10 m with f = 1731 px.
 """
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Iterable
-from dataclasses import dataclass
 
 import numpy as np
 import pyapriltags
 
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.noise import CELLS, corner_covariance
+from pipeline.detection.aruco import correctable_bits, library_family
+from pipeline.detection.found import Found, Sighting, gathered
+from pipeline.detection.prints import CLASSIC, is_aruco
+
+__all__ = ["Found", "TagFinder"]
 
 PIXEL_ORIGIN = 0.5
 """Where AprilTag's library puts the centre of the top-left pixel; ours is 0."""
-CORNERS_AS_OPENCV_PRINTS = (1, 0, 3, 2)
-CORNERS_AS_APRILTAG_PRINTS = (3, 2, 1, 0)
+CORNERS_OF_CLASSIC_PRINTS = [1, 0, 3, 2]
+CORNERS_AS_APRILTAG_PRINTS = [3, 2, 1, 0]
 """Our corners 0..3 (top-left, top-right, bottom-right, bottom-left of the print) among the library's.
 
 OpenCV draws the tags of the classic families upside down compared with the pictures that the AprilTag project hands
-out, and "the print" is OpenCV's. It has no tagStandard families: there the print is the project's own.
+out, and "the print" is OpenCV's. It has no tagStandard families: there the print is the project's own. Codes of ArUco
+dictionaries are given to the library as OpenCV draws them.
 """
-
-
-@dataclass(frozen=True)
-class Found:
-    """The tags found in one picture, sorted by family, id and place."""
-
-    family: np.ndarray
-    """(n,) object array of names."""
-    tag_id: np.ndarray
-    """(n,) int."""
-    uv: np.ndarray
-    """(n, 4, 2) corners top-left, top-right, bottom-right, bottom-left of the print; px, top-left pixel at (0, 0)."""
-    cov: np.ndarray
-    """(n, 4, 2, 2) covariance of each corner, px²."""
-    side_px: np.ndarray
-    """(n,) mean side of the quad."""
-    hamming: np.ndarray
-    """(n,) int, corrected bits."""
-    margin: np.ndarray
-    """(n,) decision margin of the decoder."""
-
-    def __len__(self) -> int:
-        return len(self.tag_id)
 
 
 class TagFinder:
     """A search for tags of some families; one thread, not to be shared between threads.
 
     One library detector serves each family, so that what one family finds does not depend on which others are asked
-    for.
+    for. Dictionaries of ArUco are parts of one another; only the ids of the one asked for are found.
+
+    Parameters
+    ----------
+    families : iterable of str
+        Of `pipeline.config.quantities.FAMILIES`.
+    settings : DetectionSettings
+        Decimation, sharpening, and how many wrong bits ArUco's codes are corrected by.
+    refine_edges : bool
+        Fit the sides of each quad to the picture before it is decoded. Without, corners are good to 0.02 to 0.04 of
+        a small tag's side, which is enough to start the photometric fit from, and some tags under 14 px are decoded
+        whose sides would have been pulled elsewhere.
     """
 
-    def __init__(self, families: Iterable[str], settings: DetectionSettings | None = None):
+    def __init__(
+        self, families: Iterable[str], settings: DetectionSettings | None = None, *, refine_edges: bool = True
+    ):
         settings = settings or DetectionSettings()
-        self._detectors = {}
-        for family in sorted(set(families)):
-            detector = pyapriltags.Detector(
-                families=family, nthreads=1, quad_decimate=settings.quad_decimate, refine_edges=1
-            )
-            assert detector.tag_detector_ptr is not None
-            # The wrapper makes an int of it, and so 0 of every value below 1.
-            detector.tag_detector_ptr.contents.decode_sharpening = settings.decode_sharpening
-            self._detectors[family] = detector
+        self._detectors = {
+            family: _detector(family, settings, refine_edges) for family in sorted(set(families))
+        }
 
     def find(self, grey: np.ndarray) -> Found:
         """Every tag of the families in a picture, (H, W) uint8; which of them to believe is decided elsewhere."""
-        rows = []
+        grey = np.ascontiguousarray(grey)
+        sightings = []
         for family, detector in self._detectors.items():
-            standard = family.startswith("tagStandard")
-            order = list(CORNERS_AS_APRILTAG_PRINTS if standard else CORNERS_AS_OPENCV_PRINTS)
-            for tag in detector.detect(np.ascontiguousarray(grey)):
+            order = CORNERS_OF_CLASSIC_PRINTS if family in CLASSIC else CORNERS_AS_APRILTAG_PRINTS
+            for tag in detector.detect(grey):
                 uv = tag.corners[order] - PIXEL_ORIGIN
-                rows.append((family, int(tag.tag_id), uv, int(tag.hamming), float(tag.decision_margin)))
-        # The library's order depends on its hash tables; equal bytes for equal pictures need one of our own.
-        rows.sort(key=lambda row: (row[0], row[1], row[2].tolist()))
-        uv = np.array([row[2] for row in rows]).reshape(-1, 4, 2)
-        return Found(
-            family=np.array([row[0] for row in rows], object),
-            tag_id=np.array([row[1] for row in rows], np.int32),
-            uv=uv,
-            cov=corner_covariance(uv, np.array([CELLS[row[0]] for row in rows], int)),
-            side_px=np.linalg.norm(np.roll(uv, -1, axis=1) - uv, axis=-1).mean(axis=1),
-            hamming=np.array([row[3] for row in rows], np.int32),
-            margin=np.array([row[4] for row in rows], float),
+                sightings.append(
+                    Sighting(family, int(tag.tag_id), uv, int(tag.hamming), float(tag.decision_margin))
+                )
+        return gathered(sightings)
+
+
+class ArucoDetector(pyapriltags.Detector):
+    """The library's detector for one ArUco dictionary; the library reads the codes where they lie until it is gone."""
+
+    def __init__(self, family: str, corrected_bits: int, decimate: float, refine_edges: bool):
+        super().__init__(families="", nthreads=1, quad_decimate=decimate, refine_edges=int(refine_edges))
+        self.codes = library_family(family)
+        assert self.libc is not None
+        self.libc.apriltag_detector_add_family_bits(
+            self.tag_detector_ptr, ctypes.byref(self.codes[0]), corrected_bits
         )
+
+
+def _detector(family: str, settings: DetectionSettings, refine_edges: bool) -> pyapriltags.Detector:
+    decimate = settings.quad_decimate
+    detector: pyapriltags.Detector
+    if is_aruco(family):
+        # The library keeps every mistaken code: two wrong bits of DICT_7X7_1000 would take 59 MB.
+        bits = min(settings.max_hamming, correctable_bits(family))
+        detector = ArucoDetector(family, bits, decimate, refine_edges)
+    else:
+        detector = pyapriltags.Detector(
+            families=family, nthreads=1, quad_decimate=decimate, refine_edges=int(refine_edges)
+        )
+    assert detector.tag_detector_ptr is not None
+    # The wrapper makes an int of it, and so 0 of every value below 1.
+    detector.tag_detector_ptr.contents.decode_sharpening = settings.decode_sharpening
+    return detector
