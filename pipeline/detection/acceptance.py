@@ -7,7 +7,7 @@ from collections.abc import Mapping, Set
 import numpy as np
 
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.apriltag import Found
+from pipeline.detection.found import Found
 from pipeline.detection.noise import widths_across
 
 ACCEPTED = "accepted"
@@ -22,6 +22,9 @@ BORDER_PX = 2.0
 """A corner this near to the border of the picture was fitted to edges that are cut off."""
 MIN_WIDTH_PX = 8.0
 """Width across the narrow way below which the noise of a corner was not measured."""
+
+POOR_RIVAL = 0.5
+"""Part of a clean tag's margin under which another of the same id, with corrected bits, is a mistake."""
 
 KnownTags = Mapping[str, Set[int]]
 """Family -> ids that machine.toml and site.toml describe."""
@@ -66,9 +69,23 @@ def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: Dete
 def _doubled(found: Found, settings: DetectionSettings) -> np.ndarray:
     """Whether another tag of the same family and id is in the picture: then neither can be told apart.
 
-    A poorly decoded one does not count: it is more likely a mistake than a second print.
+    The two files never describe a tag twice, so there are no two that belong there. A poor decoding does not count:
+    it is more likely a mistake than a second print. Poor is what would be refused by itself, and also what had bits
+    corrected and not half the margin of one that had none; that one is refused and the other stays. By margin alone
+    nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
     """
+    doubled = np.zeros(len(found), bool)
     sound = (found.margin >= settings.min_margin) & (found.hamming <= settings.max_hamming)
-    keys = [(family, int(number)) for family, number in zip(found.family, found.tag_id)]
-    seen = [key for key, good in zip(keys, sound) if good]
-    return np.array([good and seen.count(key) > 1 for key, good in zip(keys, sound)])
+    places: dict[tuple[str, int], list[int]] = {}
+    for k in np.flatnonzero(sound).tolist():
+        places.setdefault((found.family[k], int(found.tag_id[k])), []).append(k)
+    for rows in places.values():
+        if len(rows) == 1:
+            continue
+        clean = [k for k in rows if found.hamming[k] == 0]
+        doubled[rows] = True
+        if len(clean) == 1:
+            best = clean[0]
+            others = [found.margin[k] for k in rows if k != best]
+            doubled[best] = max(others) >= POOR_RIVAL * found.margin[best]
+    return doubled

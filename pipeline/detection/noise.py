@@ -56,8 +56,6 @@ class EdgeNoise:
     skew_power: float = 0.61
 
 
-CELLS = {"tag36h11": 8, "tag25h9": 7, "tag16h5": 6, "tagStandard41h12": 5}
-"""How many cells wide a family's quad is."""
 NO_QUAD_PX2 = 100.0
 """Variance of the corners of what is hardly a quad; only mistaken decodings look like that."""
 
@@ -70,7 +68,7 @@ def corner_covariance(uv: np.ndarray, cells: np.ndarray | int, noise: EdgeNoise 
     uv : (n, 4, 2) array
         Corners in order around the quad, px.
     cells : int or (n,) int array
-        Width of each quad in cells of its family, see `CELLS`.
+        Width of each quad in cells of its family, see `prints.cells_across`.
     noise : EdgeNoise
         The model of edges.
 

@@ -2,7 +2,7 @@ import numpy as np
 
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import judge
-from pipeline.detection.apriltag import Found
+from pipeline.detection.found import Found
 
 SQUARE = np.array([[0, 0], [30, 0], [30, 30], [0, 30.0]])
 SETTINGS = DetectionSettings()
@@ -52,6 +52,25 @@ def test_two_of_one_id_are_both_refused():
 
 def test_a_poor_decoding_does_not_take_a_good_one_with_it():
     assert statuses((1, 100, 100), (1, 300, 100, {"margin": 5.0})) == ["accepted", "low margin"]
+
+
+def test_a_mistaken_second_one_is_refused_and_the_real_one_stays():
+    """Texture that passes with a corrected bit and little contrast, as a real tag of that id is in view."""
+    assert statuses((1, 100, 100), (1, 300, 100, {"hamming": 1, "margin": 25.0})) == [
+        "accepted",
+        "twice in one frame",
+    ]
+    # Two such mistakes at once change nothing.
+    mistakes = [(1, 300, 100, {"hamming": 1, "margin": 25.0}), (1, 500, 300, {"hamming": 1, "margin": 29.0})]
+    assert statuses(mistakes[0], (1, 100, 100), mistakes[1])[1] == "accepted"
+
+
+def test_what_may_be_a_second_print_loses_both():
+    twice = ["twice in one frame"] * 2
+    # Clean, but in the shade: which of the two was surveyed, nobody can say.
+    assert statuses((1, 100, 100), (1, 300, 100, {"margin": 25.0})) == twice
+    assert statuses((1, 100, 100), (1, 300, 100, {"hamming": 1, "margin": 31.0})) == twice
+    assert statuses((1, 100, 100, {"hamming": 1}), (1, 300, 100, {"hamming": 1, "margin": 25.0})) == twice
 
 
 def test_an_id_of_another_family_is_unknown():

@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from benchmarks.corner_noise import measure
-from pipeline.detection.noise import CELLS, corner_covariance, edge_sigma
+from pipeline.detection.noise import corner_covariance, edge_sigma
+from pipeline.detection.prints import cells_across
 
 
 @pytest.mark.parametrize(
@@ -34,7 +35,7 @@ def test_an_acute_corner_is_least_certain_along_its_bisector():
 def test_sigma_falls_with_size_to_a_floor(family):
     sides = np.array([10, 16, 20, 25, 30, 40, 60, 80, 160, 640.0])
     quads = sides[:, None, None] * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
-    sigma = np.sqrt(corner_covariance(quads, CELLS[family])[:, 0, 0, 0])
+    sigma = np.sqrt(corner_covariance(quads, cells_across(family))[:, 0, 0, 0])
     assert np.all(np.diff(sigma) <= 0)
     assert 0.015 < sigma[-1] < 0.03
     assert sigma[0] > 0.1
