@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from benchmarks.corner_noise import measure
+from pipeline.config.quantities import FAMILIES
 from pipeline.detection.noise import corner_covariance, edge_sigma
 from pipeline.detection.prints import cells_across
 
@@ -31,7 +32,7 @@ def test_an_acute_corner_is_least_certain_along_its_bisector():
     assert abs(cov[0, 1]) < 1e-9 * cov[0, 0]
 
 
-@pytest.mark.parametrize("family", CELLS)
+@pytest.mark.parametrize("family", FAMILIES)
 def test_sigma_falls_with_size_to_a_floor(family):
     sides = np.array([10, 16, 20, 25, 30, 40, 60, 80, 160, 640.0])
     quads = sides[:, None, None] * np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
