@@ -1,0 +1,351 @@
+"""Tags followed from frame to frame between two searches, forward and backward.
+
+A search of a whole frame costs twenty times what decoding it costs, a window of one known tag a tenth. So a span of
+frames is searched whole at its first and its last frame, in between only where the picture moved on and only
+in the part of it that is new; what is found is followed. Forward first; what a later search found and the frames
+before it have not is then followed backward, until it is met or the span ends.
+
+A tag is looked for where its own motion, the picture's motion and its last place say, by the correlation of its cells
+(`windows.locate`); the decoder looks into the window only where that fails. What counts is the refinement's word: it
+fits the whole known print, and another id does not fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from pipeline.detection.acceptance import KnownTags
+from pipeline.detection.motion import Shift, Thumbnails
+from pipeline.detection.prints import cells_across
+from pipeline.detection.seen import (
+    NO_TRACK,
+    SAME_SIDES,
+    Area,
+    Finds,
+    Refines,
+    Seen,
+    joined,
+    search,
+    seen_at,
+    sides_px,
+)
+from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
+
+NEW_SHARE = 0.1
+"""Share of the picture that was not in view at the last search, from which on it is searched."""
+OVERLAP = 0.1
+"""Of the picture's width: how far that search reaches into the old part, for tags that the border had cut."""
+UNCERTAIN_S = 1.0
+"""Between searches of the whole frame while the picture's motion cannot be told."""
+DECODER_TRIES = 3
+"""Frames after a tag was lost in which the decoder looks for it; after them only its correlation tells of it."""
+SURE = 0.6
+"""Correlation of a place with which a tag that cannot be refined is still taken to be there, covered or blurred."""
+
+
+@dataclass
+class Track:
+    """A tag on its way through the frames of a span."""
+
+    number: int
+    family: str
+    tag_id: int
+    uv: np.ndarray
+    """(4, 2) where it was last, px."""
+    frame: int
+    """In which frame that was."""
+    step: np.ndarray | None = None
+    """(4, 2) velocity of its corners, px/s."""
+    lost: int = 0
+    """Frames since then."""
+
+    def at(self, uv: np.ndarray, frame: int, seconds: float) -> None:
+        """Seen again, so many seconds later (negative on the way back)."""
+        self.step = (uv - self.uv) / seconds if self.lost <= 2 and seconds else None
+        self.uv, self.frame, self.lost = uv, frame, 0
+
+
+class _Span:
+    """The frames between two searches, and what was seen in them so far."""
+
+    def __init__(self, greys: Sequence[np.ndarray], time_s: np.ndarray, shifts: Sequence[Shift]):
+        self.greys, self.time_s = greys, np.asarray(time_s, float)
+        steps = np.array([shift.uv for shift in shifts]).reshape(-1, 2)
+        self.drift = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
+        """(n, 2) way of the picture's content since the first frame."""
+        self.certain = [True, *(shift.certain for shift in shifts)]
+        self.seen: list[list[Seen]] = [[] for _ in greys]
+        self.tracks = 0
+
+    def __len__(self) -> int:
+        return len(self.greys)
+
+
+class Follower:
+    """Follows the tags in the frames of one camera.
+
+    Parameters
+    ----------
+    finder : Finds
+        Searches a picture, or a part of one.
+    refiner : Refines
+    decoder : WindowDecoder
+    thumbnails : Thumbnails
+        For pictures of this camera's size.
+    known : mapping
+        Family -> ids; others are reported where a search finds them, and not followed.
+    """
+
+    def __init__(
+        self,
+        finder: Finds,
+        refiner: Refines,
+        decoder: WindowDecoder,
+        thumbnails: Thumbnails,
+        known: KnownTags,
+    ):
+        self._finder, self._refiner, self._decoder = finder, refiner, decoder
+        self._thumbnails, self._known = thumbnails, known
+
+    def search(self, grey: np.ndarray) -> Seen:
+        """Every tag of a picture, refined."""
+        return search(grey, self._finder, self._refiner)
+
+    def follow(self, greys: Sequence[np.ndarray], time_s: np.ndarray, first: Seen, last: Seen) -> list[Seen]:
+        """What is seen in each frame of a span; it depends on nothing but the arguments.
+
+        Parameters
+        ----------
+        greys : sequence of n (H, W) uint8 arrays
+            In order of time; two or more.
+        time_s : (n,) array
+            Capture stamps, from any origin.
+        first, last : Seen
+            What searches of the first and of the last frame found.
+
+        Returns
+        -------
+        list of n Seen
+        """
+        thumbs = [self._thumbnails.of(grey) for grey in greys]
+        span = _Span(greys, time_s, [self._thumbnails.shift(a, b) for a, b in pairwise(thumbs)])
+        self._forward(span, first, last)
+        self._backward(span)
+        return [joined(parts) for parts in span.seen]
+
+    def _forward(self, span: _Span, first: Seen, last: Seen) -> None:
+        tracks: list[Track] = []
+        self._take(span, 0, first, tracks)
+        searched = 0
+        for k in range(1, len(span)):
+            if k == len(span) - 1:
+                self._take(span, k, last, tracks)
+            elif (areas := _new_parts(span, searched, k)) is not None:
+                self._take(span, k, search(span.greys[k], self._finder, self._refiner, areas), tracks)
+                searched = k
+            waiting = [track for track in tracks if track.frame != k]
+            seen = self._advance(span, k, waiting)
+            there = span.seen[k]
+            new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
+            span.seen[k].append(seen.of(new))
+            # Two tracks of one tag: the later one ends.
+            ended = set(seen.track[~new].tolist())
+            tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k)]
+
+    def _backward(self, span: _Span) -> None:
+        tracks: list[Track] = []
+        for k in range(len(span) - 1, 0, -1):
+            before = {int(number) for part in span.seen[k - 1] for number in part.track}
+            waiting = {track.number for track in tracks}
+            for part in span.seen[k]:
+                for i in np.flatnonzero(part.track != NO_TRACK).tolist():
+                    number = int(part.track[i])
+                    if number not in before and number not in waiting:
+                        tracks.append(_track_from(span, k, part, i))
+            if not tracks:
+                continue
+            seen = self._advance(span, k - 1, tracks)
+            there = span.seen[k - 1]
+            new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
+            span.seen[k - 1].append(seen.of(new))
+            ended = set(seen.track[~new].tolist()) | before
+            tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k - 1)]
+
+    def _take(self, span: _Span, k: int, found: Seen, tracks: list[Track]) -> None:
+        """What a search of frame k found, put on the tracks that lead to it or on new ones."""
+        numbers = np.full(len(found), NO_TRACK)
+        for i in range(len(found)):
+            family, tag_id = str(found.family[i]), int(found.tag_id[i])
+            if tag_id not in self._known.get(family, ()):
+                continue
+            same = [t for t in tracks if t.tag_id == tag_id and t.family == family and t.frame != k]
+            centre = found.uv[i].mean(axis=0)
+            away = [np.hypot(*(_guesses(t, span, k)[0].mean(axis=0) - centre)) for t in same]
+            side = float(sides_px(found.uv[i]))
+            seconds = span.time_s[k]
+            near = int(np.argmin(away)) if away else -1
+            if near >= 0 and (away[near] < side or same[near].lost):
+                same[near].at(found.uv[i], k, seconds - span.time_s[same[near].frame])
+                numbers[i] = same[near].number
+            else:
+                tracks.append(Track(span.tracks, family, tag_id, found.uv[i], k))
+                numbers[i] = span.tracks
+                span.tracks += 1
+        span.seen[k].append(found.on_tracks(numbers))
+
+    def _advance(self, span: _Span, k: int, tracks: Sequence[Track]) -> Seen:
+        """Look for some tracks in frame k; those found have moved on, the others are lost for a frame more."""
+        grey = span.greys[k]
+        if not tracks:
+            return seen_at(grey, self._refiner, [], [], np.zeros((0, 4, 2)))
+        guesses = [_guesses(track, span, k) for track in tracks]
+        uv, score = self._locate(grey, tracks, guesses, [_reach_px(t, span, k) for t in tracks])
+        strayed = [i for i in range(len(tracks)) if score[i] < SURE and not tracks[i].lost]
+        if strayed and len(strayed) < len(tracks):
+            # The other tags of the frame say how the camera moved, where the thumbnails could not.
+            moves = [
+                uv[i].mean(axis=0) - tracks[i].uv.mean(axis=0) for i in range(len(tracks)) if score[i] >= SURE
+            ]
+            if moves:
+                common = np.median(moves, axis=0)
+                again = [[tracks[i].uv + common] for i in strayed]
+                few = [tracks[i] for i in strayed]
+                other, better = self._locate(grey, few, again, [_reach_px(t, span, k) for t in few])
+                for j, i in enumerate(strayed):
+                    if better[j] > score[i]:
+                        uv[i], score[i] = other[j], better[j]
+        tried = [i for i in range(len(tracks)) if score[i] >= POSSIBLE]
+        seen = self._refined(grey, [tracks[i] for i in tried], uv[tried])
+        # A fit that does not stand still tells of a tag that is covered or blurred, if its cells are where it was.
+        told = np.array(
+            [
+                reason in ("", *STILL_THERE) and (not reason or score[i] > SURE)
+                for i, reason in zip(tried, seen.reason)
+            ],
+            bool,
+        )
+        parts = [seen.of(told)]
+        missing = [t for i, t in enumerate(tracks) if i not in {tried[j] for j in np.flatnonzero(told)}]
+        decoded: list[tuple[Track, np.ndarray]] = []
+        for track in missing:
+            if track.lost < DECODER_TRIES:
+                place = self._decoder.find(
+                    grey,
+                    track.family,
+                    track.tag_id,
+                    _guesses(track, span, k)[0],
+                    2.0 * _reach_px(track, span, k),
+                )
+                if place is not None:
+                    decoded.append((track, place))
+        if decoded:
+            parts.append(
+                self._refined(grey, [t for t, _ in decoded], np.array([place for _, place in decoded]))
+            )
+        seen = joined(parts)
+        left = {track.number: track for track in tracks}
+        for i, number in enumerate(seen.track.tolist()):
+            moved = left.pop(number)
+            moved.at(seen.uv[i], k, span.time_s[k] - span.time_s[moved.frame])
+        for track in left.values():
+            track.lost += 1
+        return seen
+
+    def _locate(
+        self, grey: np.ndarray, tracks: Sequence[Track], guesses: list[list[np.ndarray]], reach: list[float]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        number = np.array([len(places) for places in guesses])
+        table = np.zeros((len(tracks), int(number.max()), 4, 2))
+        for i, places in enumerate(guesses):
+            table[i, : len(places)] = places
+        return locate(
+            grey, [t.family for t in tracks], [t.tag_id for t in tracks], table, number, np.array(reach)
+        )
+
+    def _refined(self, grey: np.ndarray, tracks: Sequence[Track], uv: np.ndarray) -> Seen:
+        family, tag_id = [t.family for t in tracks], [t.tag_id for t in tracks]
+        return seen_at(grey, self._refiner, family, tag_id, uv, track=[t.number for t in tracks])
+
+
+STILL_THERE = ("covered", "over-exposed", "under-exposed", "blurred", "cut by the border")
+"""Reasons of the refinement that tell of a tag and not of its absence."""
+
+
+def _guesses(track: Track, span: _Span, k: int) -> list[np.ndarray]:
+    """Where a track may be in frame k, the likeliest first; (4, 2) each."""
+    places = [track.uv]
+    drift = span.drift[k] - span.drift[track.frame]
+    if np.abs(drift).max() > 0.5:
+        places.insert(0, track.uv + drift)
+    if track.step is not None and not track.lost:
+        places.insert(0, track.uv + track.step * (span.time_s[k] - span.time_s[track.frame]))
+    return places
+
+
+def _reach_px(track: Track, span: _Span, k: int) -> float:
+    """How far from its guesses a track is looked for: by how fast things move; little once it is lost."""
+    side = float(sides_px(track.uv))
+    cell = side / cells_across(track.family)
+    still = 1.5 * cell + 3.0
+    if track.lost >= DECODER_TRIES:
+        return still
+    drift = float(np.abs(span.drift[k] - span.drift[track.frame]).max())
+    own = 0.0
+    if track.step is not None:
+        own = float(np.abs(track.step).max() * abs(span.time_s[k] - span.time_s[track.frame]))
+    return min(still + 4.0 + 0.3 * max(drift, own), 48.0)
+
+
+def _in_view(track: Track, span: _Span, k: int) -> bool:
+    """Whether a track's tag can be in frame k at all, by where it was and how the picture moved since."""
+    height, width = span.greys[k].shape
+    for place in _guesses(track, span, k):
+        u, v = place.mean(axis=0)
+        if 0 <= u < width and 0 <= v < height:
+            return True
+    return False
+
+
+def _among(seen: Seen, i: int, others: Seen) -> bool:
+    """Whether tag i stands among others already."""
+    same = (others.tag_id == seen.tag_id[i]) & (others.family == seen.family[i])
+    if not np.any(same):
+        return False
+    away = np.linalg.norm(others.centre[same] - seen.centre[i], axis=1)
+    return bool(away.min() < SAME_SIDES * seen.side_px[i])
+
+
+def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:
+    """A track that leads back from a tag seen in frame k, with the speed it had after it."""
+    number = int(part.track[i])
+    track = Track(number, str(part.family[i]), int(part.tag_id[i]), part.uv[i], k)
+    if k + 1 < len(span):
+        for later in span.seen[k + 1]:
+            for j in np.flatnonzero(later.track == number).tolist():
+                track.step = (later.uv[j] - part.uv[i]) / (span.time_s[k + 1] - span.time_s[k])
+    return track
+
+
+def _new_parts(span: _Span, searched: int, k: int) -> list[Area] | None:
+    """The parts of frame k that came into view since the frame `searched`; None while they are small."""
+    height, width = span.greys[k].shape
+    whole = [(0, 0, width, height)]
+    if not all(span.certain[searched + 1 : k + 1]):
+        return whole if span.time_s[k] - span.time_s[searched] >= UNCERTAIN_S else None
+    du, dv = span.drift[k] - span.drift[searched]
+    share = 1.0 - max(1.0 - abs(du) / width, 0.0) * max(1.0 - abs(dv) / height, 0.0)
+    if share < NEW_SHARE:
+        return None
+    areas = []
+    if abs(du) > 0.02 * width:
+        far = int(min(abs(du) + OVERLAP * width, width))
+        areas.append((0, 0, far, height) if du > 0 else (width - far, 0, width, height))
+    if abs(dv) > 0.02 * height:
+        far = int(min(abs(dv) + OVERLAP * width, height))
+        areas.append((0, 0, width, far) if dv > 0 else (0, height - far, width, height))
+    pixels = sum((right - left) * (bottom - top) for left, top, right, bottom in areas)
+    return areas if pixels < 0.8 * width * height else whole

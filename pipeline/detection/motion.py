@@ -1,0 +1,56 @@
+"""How the picture as a whole moves from one frame to the next: thumbnails, laid over each other by their phases.
+
+A camera on a cab that swings shows a new picture every second or two; one that stands shows the same for minutes. The
+first needs denser searches and other predictions than the second. A hundredth of the pixels is enough to tell them
+apart, and costs 0.15 ms for a picture of 1280x960 where decoding it costs 3.7 ms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+THUMB_PX = 100
+"""Widest thumbnail: 80x60 of 1280x960. Twice that is no surer and costs three times as much."""
+CERTAIN = 0.08
+"""Height of the peak of the correlation below which pictures of a textured scene had nothing in common."""
+
+
+@dataclass(frozen=True)
+class Shift:
+    """Where the picture went between two frames."""
+
+    uv: np.ndarray
+    """(2,) px that the content moved, right and down; 0 where nothing can be said."""
+    certain: bool
+    """Whether the two pictures show the same scene at all."""
+
+
+class Thumbnails:
+    """Small pictures of the frames of one camera, all of one size."""
+
+    def __init__(self, width: int, height: int):
+        self._halvings = 0
+        while max(width, height) >> self._halvings > THUMB_PX:
+            self._halvings += 1
+        self.size = max(width >> self._halvings, 2), max(height >> self._halvings, 2)
+        self._scale = np.array([width / self.size[0], height / self.size[1]])
+        self._window = cv2.createHanningWindow(self.size, cv2.CV_32F)
+
+    def of(self, grey: np.ndarray) -> np.ndarray:
+        """Thumbnail of a picture, (H, W) uint8 -> (h, w) float32."""
+        # Halving by halving: OpenCV has fast code for that, and none (0.6 ms) for a sixteenth at once.
+        for _ in range(self._halvings - 1):
+            grey = cv2.resize(grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA)
+        return cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA).astype(np.float32)
+
+    def shift(self, before: np.ndarray, after: np.ndarray) -> Shift:
+        """How the content of the picture moved between two thumbnails."""
+        # A scene that stands: nothing to transform, and noise cannot pretend to a motion.
+        if np.abs(after - before).mean() < 0.5:
+            return Shift(np.zeros(2), True)
+        (u, v), peak = cv2.phaseCorrelate(before, after, self._window)
+        certain = peak > CERTAIN
+        return Shift(np.array([u, v]) * self._scale if certain else np.zeros(2), certain)

@@ -1,0 +1,210 @@
+"""Tags seen in one frame, searched or followed, as the refinement left them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
+
+import numpy as np
+
+SEARCHED = "searched"
+FOLLOWED = "followed"
+NO_TRACK = -1
+SAME_SIDES = 0.4
+"""Two quads of one id whose centres are nearer than this part of their side are one tag."""
+
+
+class Finds(Protocol):
+    """Every tag of a picture; see `pipeline.detection.apriltag.TagFinder`."""
+
+    def find(self, grey: np.ndarray) -> FoundTags: ...
+
+
+class FoundTags(Protocol):
+    """What a search gives; see `pipeline.detection.apriltag.Found`."""
+
+    family: np.ndarray
+    tag_id: np.ndarray
+    uv: np.ndarray
+    hamming: np.ndarray
+    margin: np.ndarray
+
+
+class Refines(Protocol):
+    """Lays known prints over the picture; see `pipeline.detection.refine.Refiner`."""
+
+    def refine(
+        self, grey: np.ndarray, family: Sequence[str], tag_id: Sequence[int], uv: np.ndarray
+    ) -> RefinedTags: ...
+
+
+class RefinedTags(Protocol):
+    """What a refinement gives; see `pipeline.detection.refine.Refined`."""
+
+    uv: np.ndarray
+    cov: np.ndarray
+    blur_px: np.ndarray
+    motion_px: np.ndarray
+    noise: np.ndarray
+    contrast: np.ndarray
+    whole: np.ndarray
+    misfit: np.ndarray
+    reason: np.ndarray
+
+
+@dataclass(frozen=True)
+class Seen:
+    """N tags of one frame."""
+
+    family: np.ndarray
+    """(n,) object array of names."""
+    tag_id: np.ndarray
+    """(n,) int."""
+    uv: np.ndarray
+    """(n, 4, 2) corners, refined where the fit stands, else where they were decoded; px."""
+    cov: np.ndarray
+    """(n, 8, 8) covariance of u0 v0 u1 v1 ...; 0 where the fit does not stand; px²."""
+    hamming: np.ndarray
+    """(n,) int, corrected bits; 0 of a tag that was followed: nothing was decoded."""
+    margin: np.ndarray
+    """(n,) decision margin of the decoder; NaN of a tag that was followed."""
+    blur_px: np.ndarray
+    """(n,) and so on to `misfit`: see `pipeline.detection.refine.Refined`."""
+    motion_px: np.ndarray
+    noise: np.ndarray
+    contrast: np.ndarray
+    whole: np.ndarray
+    misfit: np.ndarray
+    reason: np.ndarray
+    """(n,) object array: "" where the fit stands, else why not."""
+    how: np.ndarray
+    """(n,) object array: `SEARCHED` or `FOLLOWED`."""
+    track: np.ndarray
+    """(n,) int: which tag of the span this is; `NO_TRACK` of one that is not followed."""
+
+    def __len__(self) -> int:
+        return len(self.tag_id)
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(n, 2) mean of each quad's corners."""
+        return np.asarray(self.uv.mean(axis=1))
+
+    @property
+    def side_px(self) -> np.ndarray:
+        """(n,) mean side of each quad."""
+        return sides_px(self.uv)
+
+    def of(self, rows: np.ndarray) -> Seen:
+        """Some of them."""
+        return Seen(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def on_tracks(self, track: np.ndarray) -> Seen:
+        """The same, of these tracks."""
+        return replace(self, track=np.asarray(track, int))
+
+
+def sides_px(uv: np.ndarray) -> np.ndarray:
+    """Mean side of quads, (..., 4, 2) -> (...)."""
+    edge = uv - np.roll(uv, 1, axis=-2)
+    return np.asarray(np.sqrt(edge[..., 0] ** 2 + edge[..., 1] ** 2).mean(axis=-1))
+
+
+def seen_at(
+    grey: np.ndarray,
+    refiner: Refines,
+    family: Sequence[str] | np.ndarray,
+    tag_id: Sequence[int] | np.ndarray,
+    uv: np.ndarray,
+    hamming: np.ndarray | None = None,
+    margin: np.ndarray | None = None,
+    track: Sequence[int] | None = None,
+) -> Seen:
+    """Tags near some places, refined; those with a decision margin were searched, the others followed.
+
+    Parameters
+    ----------
+    grey : (H, W) uint8 array
+        The picture.
+    refiner : Refines
+        Of its camera.
+    family, tag_id : (n,) sequences
+        Which tags.
+    uv : (n, 4, 2) array
+        Start of the refinement, px.
+    hamming, margin : (n,) arrays, optional
+        What the decoder said.
+    track : (n,) sequence, optional
+        Their tracks.
+    """
+    n = len(tag_id)
+    uv = np.asarray(uv, float).reshape(-1, 4, 2)
+    refined = refiner.refine(grey, list(family), [int(number) for number in tag_id], uv)
+    stands = np.asarray(refined.reason == "", bool)[:, None, None]
+    return Seen(
+        family=np.array([*family], object),
+        tag_id=np.asarray(tag_id, int),
+        uv=np.where(stands, refined.uv, uv),
+        cov=np.where(stands, refined.cov, 0.0),
+        hamming=np.zeros(n, int) if hamming is None else np.asarray(hamming, int),
+        margin=np.full(n, np.nan) if margin is None else np.asarray(margin, float),
+        blur_px=refined.blur_px,
+        motion_px=refined.motion_px,
+        noise=refined.noise,
+        contrast=refined.contrast,
+        whole=refined.whole,
+        misfit=refined.misfit,
+        reason=refined.reason,
+        how=np.full(n, FOLLOWED if margin is None else SEARCHED, object),
+        track=np.full(n, NO_TRACK) if track is None else np.asarray(track, int),
+    )
+
+
+Area = tuple[int, int, int, int]
+"""Part of a picture: first column, first row, column and row after the last."""
+
+
+def search(grey: np.ndarray, finder: Finds, refiner: Refines, areas: Sequence[Area] | None = None) -> Seen:
+    """Every tag of a picture, or of some parts of it, refined; sorted by family, id and place."""
+    whole = (0, 0, grey.shape[1], grey.shape[0])
+    rows: list[tuple[str, int, np.ndarray, int, float]] = []
+    for left, top, right, bottom in areas or [whole]:
+        found = finder.find(grey[top:bottom, left:right])
+        for k in range(len(found.tag_id)):
+            uv = found.uv[k] + (left, top)
+            row = (
+                str(found.family[k]),
+                int(found.tag_id[k]),
+                uv,
+                int(found.hamming[k]),
+                float(found.margin[k]),
+            )
+            if not any(row[:2] == other[:2] and _same(uv, other[2]) for other in rows):
+                rows.append(row)
+    family, tag_id = [row[0] for row in rows], [row[1] for row in rows]
+    uv = np.array([row[2] for row in rows]).reshape(-1, 4, 2)
+    hamming, margin = np.array([row[3] for row in rows], int), np.array([row[4] for row in rows], float)
+    return joined([seen_at(grey, refiner, family, tag_id, uv, hamming, margin)])
+
+
+def _same(a: np.ndarray, b: np.ndarray) -> bool:
+    return bool(np.hypot(*(a.mean(axis=0) - b.mean(axis=0))) < SAME_SIDES * sides_px(a))
+
+
+def joined(parts: Sequence[Seen]) -> Seen:
+    """All that is seen in one frame, sorted by family, id and place."""
+    assert parts
+    if len(parts) == 1:
+        whole = parts[0]
+    else:
+        columns = {
+            field.name: np.concatenate([getattr(part, field.name) for part in parts])
+            for field in fields(Seen)
+        }
+        whole = Seen(**columns)
+    order = sorted(
+        range(len(whole)),
+        key=lambda k: (whole.family[k], int(whole.tag_id[k]), whole.uv[k, 0, 0], whole.uv[k, 0, 1]),
+    )
+    return whole.of(np.array(order, int))
