@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated
 
 import numpy as np
@@ -114,6 +115,18 @@ ALSO_CALLED = {
     "DICT_APRILTAG_16h5": "tag16h5",
 }
 """What OpenCV calls families that have a name here already; two names would make two families of one."""
+
+
+def dictionary_of(family: str) -> str:
+    """The table a family's tags are taken from: DICT_4X4_50 is the beginning of DICT_4X4, as is DICT_4X4_1000."""
+    stem, _, count = family.rpartition("_")
+    return stem if count.isdigit() else family
+
+
+def smallest_family(family: str, tag_ids: Collection[int]) -> str:
+    """The smallest of the families of the same table that has all of some ids."""
+    parts = [other for other in FAMILIES if dictionary_of(other) == dictionary_of(family)]
+    return min((other for other in parts if FAMILIES[other] > max(tag_ids)), key=FAMILIES.__getitem__)
 
 
 def _known_family(name: str) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.found import Found
 from pipeline.detection.noise import widths_across
+from pipeline.detection.prints import hamming_limit
 
 ACCEPTED = "accepted"
 UNKNOWN_ID = "unknown id"
@@ -61,9 +62,14 @@ def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: Dete
     status[widths_across(found.uv).min(axis=1) < MIN_WIDTH_PX] = TOO_SMALL
     status[_doubled(found, settings)] = TWICE
     status[found.margin < settings.min_margin] = LOW_MARGIN
-    status[found.hamming > settings.max_hamming] = BIT_ERRORS
+    status[found.hamming > hamming_limits(found, settings)] = BIT_ERRORS
     status[~described] = UNKNOWN_ID
     return status
+
+
+def hamming_limits(found: Found, settings: DetectionSettings) -> np.ndarray:
+    """(n,) int, bits that may have been corrected in each tag: fewer than the settings say where codes are short."""
+    return np.array([min(settings.max_hamming, hamming_limit(family)) for family in found.family], int)
 
 
 def _doubled(found: Found, settings: DetectionSettings) -> np.ndarray:
@@ -75,7 +81,7 @@ def _doubled(found: Found, settings: DetectionSettings) -> np.ndarray:
     nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
     """
     doubled = np.zeros(len(found), bool)
-    sound = (found.margin >= settings.min_margin) & (found.hamming <= settings.max_hamming)
+    sound = (found.margin >= settings.min_margin) & (found.hamming <= hamming_limits(found, settings))
     places: dict[tuple[str, int], list[int]] = {}
     for k in np.flatnonzero(sound).tolist():
         places.setdefault((found.family[k], int(found.tag_id[k])), []).append(k)

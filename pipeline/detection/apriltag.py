@@ -17,7 +17,7 @@ import pyapriltags
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.aruco import correctable_bits, library_family
 from pipeline.detection.found import Found, Sighting, gathered
-from pipeline.detection.prints import CLASSIC, is_aruco
+from pipeline.detection.prints import CLASSIC, hamming_limit, is_aruco
 
 __all__ = ["Found", "TagFinder"]
 
@@ -90,7 +90,7 @@ def _detector(family: str, settings: DetectionSettings, refine_edges: bool) -> p
     detector: pyapriltags.Detector
     if is_aruco(family):
         # The library keeps every mistaken code: two wrong bits of DICT_7X7_1000 would take 59 MB.
-        bits = min(settings.max_hamming, correctable_bits(family))
+        bits = min(settings.max_hamming, hamming_limit(family), correctable_bits(family))
         detector = ArucoDetector(family, bits, decimate, refine_edges)
     else:
         detector = pyapriltags.Detector(

@@ -14,6 +14,7 @@ import numpy as np
 from pipeline import tables
 from pipeline.config import Machine, Site, load_machine, load_site
 from pipeline.config.document import decode, read_file
+from pipeline.config.quantities import FAMILIES, dictionary_of
 from pipeline.errors import ArtefactError, ConfigError, LogError, UsageError
 from pipeline.runs import RunFolder, atomic_write, json_bytes
 from pipeline.stages import Stage, stage_named
@@ -201,12 +202,25 @@ def describe(
     """
     machine_data, machine_name, machine_source = _description(log, "machine.toml", machine, attachments)
     site_data, site_name, site_source = _description(log, "site.toml", site, attachments)
-    return (
-        load_machine(decode(machine_data, machine_name), machine_name),
-        machine_source,
-        load_site(decode(site_data, site_name), site_name),
-        site_source,
-    )
+    read_machine = load_machine(decode(machine_data, machine_name), machine_name)
+    read_site = load_site(decode(site_data, site_name), site_name)
+    _refuse_parts_of_one_dictionary(read_machine, read_site)
+    return read_machine, machine_source, read_site, site_source
+
+
+def _refuse_parts_of_one_dictionary(machine: Machine, site: Site) -> None:
+    # Tag 7 of DICT_4X4_50 is tag 7 of DICT_4X4_100: each would be found twice, and two markers might share it unseen.
+    first: dict[str, tuple[str, str]] = {}
+    marks = [(f"markers.{name}", mark.family) for name, mark in machine.markers.items()]
+    marks += [(f"benchmarks.{name}", mark.family) for name, mark in site.benchmarks.items()]
+    for name, family in marks:
+        other, named = first.setdefault(dictionary_of(family), (name, family))
+        if named != family:
+            larger = max(named, family, key=FAMILIES.__getitem__)
+            raise ConfigError(
+                f"{other} has tags of {named} and {name} of {family}, which is the same dictionary with more or fewer "
+                f"tags; write {larger} for both, the ids stay"
+            )
 
 
 def _description(

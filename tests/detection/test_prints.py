@@ -7,7 +7,14 @@ import pytest
 
 from benchmarks._tag_picture import View, picture
 from pipeline.config.quantities import FAMILIES
-from pipeline.detection.prints import aruco_dictionary, cells_across, is_aruco, print_of
+from pipeline.detection.prints import (
+    aruco_dictionary,
+    cells_across,
+    hamming_limit,
+    is_aruco,
+    print_of,
+    spare_bits,
+)
 from pipeline.errors import DetectionError
 
 APRILTAG = [family for family in FAMILIES if not is_aruco(family)]
@@ -90,6 +97,28 @@ def test_the_quad_is_so_many_cells_wide(family, cells, across):
     outside[first : first + across, first : first + across] = False
     assert len(np.unique(print_.cells[ring])) == len(np.unique(print_.cells[outside])) == 1
     assert print_.cells[ring][0] != print_.cells[outside][0]
+
+
+def test_bits_to_spare_are_what_random_quads_say():
+    """Random bits, read in four turns, against the codes: the share that is a tag is ``2 ** -spare_bits``."""
+    family, n = "DICT_4X4_250", 40_000
+    codes = {
+        np.rot90(print_of(family, number).cells[2:-2, 2:-2], turn).astype(np.uint8).tobytes()
+        for number in range(FAMILIES[family])
+        for turn in range(4)
+    }
+    draws = np.random.default_rng(3).integers(0, 2, (n, 4, 4), dtype=np.uint8)
+    share = np.mean([draw.tobytes() in codes for draw in draws])
+    print(f"share of random quads that are a tag: {share:.4f}")
+    assert share == pytest.approx(2 ** -spare_bits(family), rel=0.15)
+
+
+@pytest.mark.parametrize("family, limit", [
+    ("tag36h11", 2), ("tag25h9", 1), ("tag16h5", 0), ("tagStandard41h12", 2), ("DICT_4X4_50", 0),
+    ("DICT_5X5_100", 1), ("DICT_5X5_1000", 0), ("DICT_7X7_1000", 2), ("DICT_ARUCO_ORIGINAL", 0),
+])  # fmt: skip
+def test_bits_are_corrected_only_where_there_are_bits_to_spare(family, limit):
+    assert hamming_limit(family) == limit
 
 
 def test_prints_are_kept_and_cannot_be_written_to():

@@ -5,12 +5,13 @@ import json
 import numpy as np
 import pytest
 
+from benchmarks._tag_picture import View
 from pipeline import tables
 from pipeline.errors import ConfigError, DetectionError, LogError
 from pipeline.logs.writer import LogWriter
 from pipeline.stages import detect, ingest, stage_named
 
-from .conftest import HEIGHT, MACHINE, SITE, START, STEP, WIDTH, Watch, open_job, write_log
+from .conftest import HEIGHT, MACHINE, SITE, START, STEP, WIDTH, Watch, canvas, open_job, write_log
 
 
 def ingested(job):
@@ -118,6 +119,43 @@ def test_a_wrong_family_is_found_out(shift, tmp_path):
             detected(job)
     finally:
         open_job(shift.parent, shift, runs=str(tmp_path))
+
+
+def test_a_wrong_aruco_dictionary_is_found_out_and_the_smallest_that_fits_is_named(tmp_path):
+    """DICT_6X6_100 stands in the picture, DICT_6X6_50 in the files; texture in between makes no names."""
+    rng = np.random.default_rng(9)
+    views = [(View("DICT_6X6_1000", 77, 40, 10, 0, 5), 120, 60), (View("DICT_6X6_1000", 93, 40), 5, 5)]
+    jpeg = canvas(views, rng)
+    log = spoiled(None, tmp_path, lambda camera, k, _, t: (jpeg, t))
+    machine = MACHINE.replace('family = "tag36h11"', 'family = "DICT_6X6_50"')
+    site = SITE.replace('family = "tag25h9"', 'family = "DICT_6X6_50"')
+    with pytest.raises(
+        DetectionError, match=r"seen that nothing describes: DICT_6X6_100 ids 77, 93; described"
+    ):
+        both(tmp_path, log, machine=machine, site=site)
+
+
+def test_an_aruco_marker_goes_through_both_stages(tmp_path):
+    rng = np.random.default_rng(10)
+    views = [(View("DICT_5X5_100", 1, 40, 10, 0, 5), 120, 60), (View("DICT_5X5_100", 2, 40), 5, 5)]
+    jpeg = canvas(views, rng)
+    log = spoiled(None, tmp_path, lambda camera, k, _, t: (jpeg, t))
+    machine = MACHINE.replace('family = "tag36h11"', 'family = "DICT_5X5_100"')
+    site = SITE.replace('family = "tag25h9"', 'family = "DICT_5X5_100"')
+    counts, watch, _ = both(tmp_path, log, machine=machine, site=site)
+    assert watch.warnings == []
+    assert counts["tags accepted"] == {"front": 24, "side": 24}
+
+
+def test_two_sizes_of_one_dictionary_are_refused(tmp_path):
+    log = spoiled(None, tmp_path, None)
+    machine = MACHINE.replace('family = "tag36h11"', 'family = "DICT_5X5_100"')
+    site = SITE.replace('family = "tag25h9"', 'family = "DICT_5X5_50"')
+    with pytest.raises(
+        ConfigError,
+        match=r"markers.plate has tags of DICT_5X5_100 and benchmarks.bm of DICT_5X5_50.*write DICT_5X5_100 for both",
+    ):
+        open_job(tmp_path, log, machine=machine, site=site)
 
 
 def test_stamps_that_run_backwards_are_sorted_counted_and_told(shift, tmp_path):
