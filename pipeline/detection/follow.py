@@ -19,6 +19,7 @@ from itertools import pairwise
 import numpy as np
 
 from pipeline.detection.acceptance import KnownTags
+from pipeline.detection.boards import Board
 from pipeline.detection.motion import Shift, Thumbnails
 from pipeline.detection.prints import cells_across
 from pipeline.detection.seen import (
@@ -98,6 +99,8 @@ class Follower:
         For pictures of this camera's size.
     known : mapping
         Family -> ids; others are reported where a search finds them, and not followed.
+    boards : sequence of Board
+        Which of them are printed together.
     """
 
     def __init__(
@@ -107,9 +110,11 @@ class Follower:
         decoder: WindowDecoder,
         thumbnails: Thumbnails,
         known: KnownTags,
+        boards: Sequence[Board] = (),
     ):
         self._finder, self._refiner, self._decoder = finder, refiner, decoder
         self._thumbnails, self._known = thumbnails, known
+        self._boards = [board for board in boards if len(board.tag_id) > 1]
 
     def search(self, grey: np.ndarray) -> Seen:
         """Every tag of a picture, refined."""
@@ -140,6 +145,7 @@ class Follower:
     def _forward(self, span: _Span, first: Seen, last: Seen) -> None:
         tracks: list[Track] = []
         self._take(span, 0, first, tracks)
+        self._complete(span, 0, tracks)
         searched = 0
         for k in range(1, len(span)):
             if k == len(span) - 1:
@@ -152,6 +158,7 @@ class Follower:
             there = span.seen[k]
             new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
             span.seen[k].append(seen.of(new))
+            self._complete(span, k, tracks)
             # Two tracks of one tag: the later one ends.
             ended = set(seen.track[~new].tolist())
             tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k)]
@@ -172,6 +179,7 @@ class Follower:
             there = span.seen[k - 1]
             new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
             span.seen[k - 1].append(seen.of(new))
+            self._complete(span, k - 1, tracks)
             ended = set(seen.track[~new].tolist()) | before
             tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k - 1)]
 
@@ -254,6 +262,33 @@ class Follower:
         for track in left.values():
             track.lost += 1
         return seen
+
+    def _complete(self, span: _Span, k: int, tracks: list[Track]) -> None:
+        """Look for what is missing of the boards of which a part is seen in frame k."""
+        if not self._boards:
+            return
+        grey = span.greys[k]
+        height, width = grey.shape
+        there = {
+            (str(part.family[i]), int(part.tag_id[i])): part.uv[i]
+            for part in span.seen[k]
+            for i in np.flatnonzero(part.reason == "").tolist()
+        }
+        wanted = []
+        for board in self._boards:
+            mine = {
+                number: uv for number in board.tag_id if (uv := there.get((board.family, number))) is not None
+            }
+            for tag_id, uv in board.places(mine).items():
+                if np.all((uv > 0) & (uv < (width - 1, height - 1))):
+                    wanted.append(Track(-1, board.family, tag_id, uv, k))
+        if not wanted:
+            return
+        reach = [1.5 * float(sides_px(track.uv)) / cells_across(track.family) for track in wanted]
+        uv, score = self._locate(grey, wanted, [[track.uv] for track in wanted], reach)
+        likely = np.flatnonzero(score >= SURE)
+        seen = self._refined(grey, [wanted[i] for i in likely], uv[likely])
+        self._take(span, k, seen.of(np.flatnonzero(seen.reason == "")), tracks)
 
     def _locate(
         self, grey: np.ndarray, tracks: Sequence[Track], guesses: list[list[np.ndarray]], reach: list[float]

@@ -29,6 +29,9 @@ STEPS_AWAY = 14
 CORNER = 0.3
 """Of a cell, from its centre: where its edges are felt, blur of a third of a cell notwithstanding."""
 
+ENOUGH = 0.7
+"""Part of a print's cells that must lie in the picture: the white rim of a tag at the border may be cut off."""
+
 SMALL_PX = 25.0
 LARGE_PX = 80.0
 SHARPENING = 0.5
@@ -109,43 +112,39 @@ def _centres(uv, n, border, at):
 
 
 @numba.njit(cache=True)
-def _correlation(grey, at, pattern, dx, dy):
-    """Of the cells with the grey values under their centres moved by (dx, dy); -1 outside the picture."""
+def _correlation(grey, at, pattern, dx, dy, smooth):
+    """Of the cells with the grey values under their centres moved by (dx, dy): interpolated, or of the nearest pixels,
+    three times as fast. Cells outside the picture do not count; -1 where they are too many.
+    """
     height, width = grey.shape
-    total, square, product = 0.0, 0.0, 0.0
+    total, square, product, mean, norm = 0.0, 0.0, 0.0, 0.0, 0.0
     n = len(at)
+    inside = 0
+    half = 0.0 if smooth else 0.5
     for k in range(n):
-        x, y = at[k, 0] + dx, at[k, 1] + dy
-        if not (x >= 0.0 and y >= 0.0 and x < width - 1.0 and y < height - 1.0):
-            return -1.0
+        x, y = at[k, 0] + dx + half, at[k, 1] + dy + half
+        if not (x >= 0.0 and y >= 0.0 and x < width - 1.0 + half and y < height - 1.0 + half):
+            continue
         i, j = int(x), int(y)
-        fx, fy = x - i, y - j
-        top = grey[j, i] + fx * (float(grey[j, i + 1]) - float(grey[j, i]))
-        low = grey[j + 1, i] + fx * (float(grey[j + 1, i + 1]) - float(grey[j + 1, i]))
-        value = top + fy * (low - top)
+        if smooth:
+            fx, fy = x - i, y - j
+            top = grey[j, i] + fx * (float(grey[j, i + 1]) - float(grey[j, i]))
+            low = grey[j + 1, i] + fx * (float(grey[j + 1, i + 1]) - float(grey[j + 1, i]))
+            value = top + fy * (low - top)
+        else:
+            value = float(grey[j, i])
+        inside += 1
         total += value
         square += value * value
         product += pattern[k] * value
-    spread = square - total * total / n
+        mean += pattern[k]
+        norm += pattern[k] * pattern[k]
+    if inside < ENOUGH * n:
+        return -1.0
+    spread = square - total * total / inside
+    print_spread = norm - mean * mean / inside
     # Grey values that hardly differ correlate with anything: 2 levels is less than any print keeps.
-    return product / np.sqrt(max(spread, 4.0 * n))
-
-
-@numba.njit(cache=True)
-def _nearest_correlation(grey, at, pattern, dx, dy):
-    """As `_correlation`, of the nearest pixels: three times as fast."""
-    height, width = grey.shape
-    total, square, product = 0.0, 0.0, 0.0
-    n = len(at)
-    for k in range(n):
-        x, y = at[k, 0] + dx + 0.5, at[k, 1] + dy + 0.5
-        if not (x >= 0.0 and y >= 0.0 and x < width and y < height):
-            return -1.0
-        value = float(grey[int(y), int(x)])
-        total += value
-        square += value * value
-        product += pattern[k] * value
-    return product / np.sqrt(max(square - total * total / n, 4.0 * n))
+    return (product - mean * total / inside) / np.sqrt(max(spread, 4.0 * inside) * max(print_spread, 1e-3))
 
 
 @numba.njit(cache=True)
@@ -174,10 +173,7 @@ def _locate(grey, pattern, border, guesses, number, reach_px, uv):
             away = 2 if wide == 0 else min(int(np.ceil(reach_px / step)), STEPS_AWAY)
             for j in range(-away, away + 1):
                 for i in range(-away, away + 1):
-                    if wide == 0:
-                        score = _correlation(grey, at, flat, i * step, j * step)
-                    else:
-                        score = _nearest_correlation(grey, at, flat, i * step, j * step)
+                    score = _correlation(grey, at, flat, i * step, j * step, wide == 0)
                     if score > best:
                         best, best_dx, best_dy, which = score, i * step, j * step, k
             # A likely guess that fits needs no other.
@@ -207,12 +203,12 @@ def _locate(grey, pattern, border, guesses, number, reach_px, uv):
                 fine[4 * k + corner, 0] = at[k, 0] + s * ax + t * bx
                 fine[4 * k + corner, 1] = at[k, 1] + s * ay + t * by
                 twice[4 * k + corner] = 0.5 * flat[k]
-    best = _correlation(grey, fine, twice, best_dx, best_dy)
+    best = _correlation(grey, fine, twice, best_dx, best_dy, True)
     for step in (0.2 * cell, 0.1 * cell, 0.05 * cell):
         from_dx, from_dy = best_dx, best_dy
         for j in range(-1, 2):
             for i in range(-1, 2):
-                score = _correlation(grey, fine, twice, from_dx + i * step, from_dy + j * step)
+                score = _correlation(grey, fine, twice, from_dx + i * step, from_dy + j * step, True)
                 if score > best:
                     best, best_dx, best_dy = score, from_dx + i * step, from_dy + j * step
     for corner in range(4):
