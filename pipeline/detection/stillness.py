@@ -7,8 +7,8 @@ for a size class, so that a few that were not quite still do not decide.
 
 Two ratios come out. The **noise** of a corner beside the shift that all corners of its tag share, over its
 prediction: this one judges the covariances. And the **shake** of whole tags over what that noise explains: on a
-machine whose engine runs it is real and the adjustment follows it; where tag and camera are fixed to one another
-(`rigid`) it is an error, of the mount or of hot air.
+machine whose engine runs it is real and the adjustment follows it; only where tag and camera cannot move against one
+another it is an error, of the mount or of hot air (the report tells which those are).
 
 The scatter says nothing on errors that repeat from frame to frame (blur, light, the place within a pixel, a bent
 print): a ratio far below 1 may be right where the prediction covers those.
@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import pairwise
 from typing import Any
@@ -42,8 +42,8 @@ HOPELESS_PX = 2.0
 """Predicted sigma of what is hardly a quad; such tags say nothing on pixels."""
 SIZES_PX = (0.0, 25.0, 50.0, 100.0, math.inf)
 """Borders of the size classes, mean side of the quad."""
-RATIO_HIGH, RATIO_LOW = 1.5, 0.5
-"""Beyond these, and by more than chance, a ratio is told."""
+RATIO_HIGH = 1.5
+"""A ratio above it by more than chance warns."""
 SURE = 1.96
 """Half width of the interval of a ratio, in its standard deviations: 95 %."""
 FEW_WINDOWS = 6
@@ -110,15 +110,9 @@ class Stillness:
     """Finds the still stretches of one camera's tags in portions of the table `detections`.
 
     The portions come in time order; where they are cut makes no difference.
-
-    Parameters
-    ----------
-    rigid : set of tags
-        Those that are fixed to the camera: on the same body, or both on the ground. Any movement of theirs is an error.
     """
 
-    def __init__(self, rigid: Set[Tag] = frozenset()) -> None:
-        self.rigid = rigid
+    def __init__(self) -> None:
         self.at_rest = 0
         """Tags in frames that stood still: rows of the table."""
         self._waiting: dict[Tag, Stretch] = {}
@@ -216,16 +210,14 @@ def facts(stillness: Stillness) -> dict[str, Any]:
     return {
         "sizes": [{**size_of(size), **asdict(found)} for size, found in stillness.by_size().items()],
         "tags": [
-            {"family": family, "tag_id": number, "rigid": (family, number) in stillness.rigid}
-            | size_of(size)
-            | asdict(found)
+            {"family": family, "tag_id": number} | size_of(size) | asdict(found)
             for ((family, number), size), found in stillness.by_tag().items()
         ],
     }
 
 
 def warnings(camera: str, stillness: Stillness) -> list[str]:
-    """A sentence for each size class whose noise, and for the rigid tags whose shake, is above what was predicted."""
+    """A sentence for each size class whose noise is surely above what was predicted."""
     said = []
     for size, found in stillness.by_size().items():
         if found.ratio_low > RATIO_HIGH:
@@ -235,18 +227,6 @@ def warnings(camera: str, stillness: Stillness) -> list[str]:
                 "strong compression, heat haze or a rolling shutter with vibration may be why, and what rests on this "
                 "camera is less certain than stated"
             )
-    shaken = [
-        (tag, found)
-        for (tag, _), found in stillness.by_tag().items()
-        if tag in stillness.rigid and found.shake_low > RATIO_HIGH
-    ]
-    if shaken:
-        (family, number), worst = max(shaken, key=lambda one: one[1].shake_ratio)
-        said.append(
-            f"camera '{camera}' shakes against {len({tag for tag, _ in shaken})} of the tags that cannot move "
-            f"against it, {family} id {number} by {worst.shake_px:.3f} px, {worst.shake_ratio:.1f} times what "
-            "the noise of its corners explains; a shaking camera mount, a loose tag or heat haze may be why"
-        )
     return said
 
 

@@ -24,6 +24,10 @@ Each stage is one module ``pipeline/stages/<name>.py`` with one function::
 `log.json`, written by ingest: {"recovery": fields of `logs.reader.Recovery`, "start_ns", "end_ns", "channels": [...],
 "clock": {...}, "calibrations": {camera: {"topic", "width", "height", "fx", "fy", "cx", "cy", "distortion": [5]}}}.
 
+`detection.json`, written by detect: {"cameras": {camera: {"frames": {outcome: number}, "tags": {status: number},
+"how": {searched or followed: number}, "pixel_noise": {"sizes": [...], "tags": [...]}}}}; each entry of the two lists
+has "size", "low_px" and "high_px" (null: no limit) of its size class and the fields of `detection.stillness.Scatter`.
+
 The table below is the one place where their order stands, what each depends on and which settings it uses. A stage is
 redone when its version, a schema of its tables, an output of a stage it needs, a file it reads or one of its settings
 changed, and for no other reason: raise the version when the same input gives another result.
@@ -128,7 +132,7 @@ class Stage:
 
 STAGES = (
     Stage("ingest", 1, "reading the log", (), ("log",), ("frames", "sensors"), _reading),
-    Stage("detect", 1, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
+    Stage("detect", 2, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
         1,

@@ -25,6 +25,8 @@ from pipeline.detection.slices import (
     search_slices,
     slices_of,
 )
+from pipeline.detection.stillness import warnings
+from pipeline.detection.tally import Tally
 from pipeline.errors import DetectionError
 from pipeline.logs.reader import read_log
 from pipeline.stages.job import Counts, Job
@@ -52,28 +54,30 @@ def run(job: Job, progress: Progress) -> Counts:
     progress.total(sum(len(part.frame) for part in slices), "frames")
     search_slices(search, slices, job.workers, lambda part: progress.advance(len(part.frame)))
 
+    tallies: dict[str, Tally] = {}
     frames: Counter[str] = Counter()
     status: Counter[str] = Counter()
-    accepted: dict[str, int] = {}
     seen: Counter[tuple[str, int]] = Counter()
     for camera in topics:
-        mine = [part for part in slices if part.camera == camera]
-        of_camera, tags, ids = _join(job, camera, mine)
-        _judge_pictures(camera, of_camera, progress)
-        frames.update(of_camera)
-        status.update(tags)
-        seen.update(ids)
-        accepted[camera] = tags[ACCEPTED]
+        tally = tallies[camera] = _join(job, camera, [part for part in slices if part.camera == camera])
+        _judge_pictures(camera, tally.frames, progress)
+        frames.update(tally.frames)
+        status.update(tally.status)
+        seen.update(tally.unknown)
     if not status[ACCEPTED]:
         others = _other_families(search, slices) if not status else Counter()
         _refuse_without_markers(job, frames, status, seen + others, known)
-    for camera, count in accepted.items():
-        if not count:
+    for camera, tally in tallies.items():
+        if not tally.status[ACCEPTED]:
             progress.warn(f"camera '{camera}': not one marker was accepted in its frames")
+        for sentence in warnings(camera, tally.stillness):
+            progress.warn(sentence)
+    job.write_json("detection.json", {"cameras": {name: tally.facts() for name, tally in tallies.items()}})
     return {
         "frames": dict(frames.most_common()),
-        "tags accepted": accepted,
+        "tags accepted": {camera: tally.status[ACCEPTED] for camera, tally in tallies.items()},
         "tags rejected": {name: count for name, count in status.most_common() if name != ACCEPTED},
+        "tags at rest": {camera: tally.stillness.at_rest for camera, tally in tallies.items()},
     }
 
 
@@ -85,34 +89,20 @@ def known_tags(job: Job) -> dict[str, frozenset[int]]:
     return {family: frozenset(numbers) for family, numbers in sorted(ids.items())}
 
 
-def _join(
-    job: Job, camera: str, slices: Sequence[Slice]
-) -> tuple[Counter[str], Counter[str], Counter[tuple[str, int]]]:
-    """Put the pieces of a camera together; frames by outcome, tags by status, unknown tags by family and id."""
-    frames: Counter[str] = Counter()
-    status: Counter[str] = Counter()
-    unknown: Counter[tuple[str, int]] = Counter()
+def _join(job: Job, camera: str, slices: Sequence[Slice]) -> Tally:
+    """Put the pieces of a camera together and count what is in them."""
+    tally = Tally(job.site.detection)
     kept: list[dict[str, np.ndarray]] = [tables.empty_columns("detections")]
     with job.table_writer("detections", part=camera) as writer:
         for number, part in enumerate(slices):
             piece = read_piece(part)
             kept.append(piece.columns)
-            frames.update(piece.frames)
-            status.update(piece.columns["status"].tolist())
-            rows = piece.columns["status"] == UNKNOWN_ID
-            good = (
-                rows
-                & (piece.columns["hamming"] == 0)
-                & (piece.columns["margin"] >= job.site.detection.min_margin)
-            )
-            unknown.update(
-                zip(piece.columns["family"][good].tolist(), piece.columns["tag_id"][good].tolist())
-            )
+            tally.add(piece.columns, piece.frames)
             last = number == len(slices) - 1
             if last or sum(len(columns["frame"]) for columns in kept) >= PORTION_ROWS:
                 writer.write({name: np.concatenate([columns[name] for columns in kept]) for name in kept[0]})
                 kept = [tables.empty_columns("detections")]
-    return frames, status, unknown
+    return tally
 
 
 def _judge_pictures(camera: str, frames: Counter[str], progress: Progress) -> None:

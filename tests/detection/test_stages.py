@@ -57,12 +57,17 @@ def test_a_sound_log_gives_its_tables_and_no_warning(shift, tmp_path):
     counts, watch, here = detected(job)
     assert watch.warnings == []
     assert watch.done == 160
-    assert here.written == ["detections/front.parquet", "detections/side.parquet"]
+    assert here.written == ["detections/front.parquet", "detections/side.parquet", "detection.json"]
     assert counts == {
         "frames": {"searched": 160},
         "tags accepted": {"front": 160, "side": 160},
         "tags rejected": {"unknown id": 160},
+        "tags at rest": {"front": 0, "side": 0},  # the tags jump by parts of a pixel
     }
+    facts = json.loads(job.folder.file("detection.json").read_text())["cameras"]["side"]
+    assert facts["frames"] == {"searched": 80}
+    assert facts["tags"] == {"accepted": 160, "unknown id": 80}
+    assert facts["pixel_noise"] == {"sizes": [], "tags": []}
     found = tables.read_table(job.folder.file("detections/front.parquet"), "detections")
     assert np.all(np.diff(found["frame"]) >= 0)
     assert len(found["frame"]) == 240
