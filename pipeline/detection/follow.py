@@ -1,9 +1,9 @@
 """Tags followed from frame to frame between two searches, forward and backward.
 
 A search of a whole frame costs twenty times what decoding it costs, a window of one known tag a tenth. So a span of
-frames is searched whole at its first and its last frame, in between only where the picture moved on and only
-in the part of it that is new; what is found is followed. Forward first; what a later search found and the frames
-before it have not is then followed backward, until it is met or the span ends.
+frames is searched whole at its first and its last frame, in between only where the picture has moved on; a glance
+with a quarter of the resolution now and then finds what comes and goes. What is found is followed. Forward first; what
+a later search found and the frames before it have not is then followed backward, until it is met or the span ends.
 
 A tag is looked for where its own motion, the picture's motion and its last place say, by the correlation of its cells
 (`windows.locate`); the decoder looks into the window only where that fails. What counts is the refinement's word: it
@@ -14,18 +14,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
 from pipeline.detection.acceptance import KnownTags
 from pipeline.detection.boards import Board
-from pipeline.detection.motion import Shift, Thumbnails
+from pipeline.detection.motion import Drift, Thumbnails
 from pipeline.detection.prints import cells_across
 from pipeline.detection.seen import (
     NO_TRACK,
     SAME_SIDES,
-    Area,
     Finds,
     Refines,
     Seen,
@@ -36,10 +34,13 @@ from pipeline.detection.seen import (
 )
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
-NEW_SHARE = 0.1
-"""Share of the picture that was not in view at the last search, from which on it is searched."""
-OVERLAP = 0.1
-"""Of the picture's width: how far that search reaches into the old part, for tags that the border had cut."""
+GLANCE_S = 1.0
+"""Between two glances: searches of the frame decimated by four. They take a twelfth of a search and miss tags under
+some 40 px; what comes from behind something and goes again within a span is found by them."""
+GLANCE_SHARE = 0.15
+"""Part of the picture that was not in view at the last glance, from which on the next one is due."""
+SEARCH_SHARE = 0.6
+"""The same for searches of the whole frame."""
 UNCERTAIN_S = 1.0
 """Between searches of the whole frame while the picture's motion cannot be told."""
 DECODER_TRIES = 3
@@ -73,12 +74,9 @@ class Track:
 class _Span:
     """The frames between two searches, and what was seen in them so far."""
 
-    def __init__(self, greys: Sequence[np.ndarray], time_s: np.ndarray, shifts: Sequence[Shift]):
+    def __init__(self, greys: Sequence[np.ndarray], time_s: np.ndarray, drift: Drift):
         self.greys, self.time_s = greys, np.asarray(time_s, float)
-        steps = np.array([shift.uv for shift in shifts]).reshape(-1, 2)
-        self.drift = np.concatenate([np.zeros((1, 2)), np.cumsum(steps, axis=0)])
-        """(n, 2) way of the picture's content since the first frame."""
-        self.certain = [True, *(shift.certain for shift in shifts)]
+        self.drift, self.certain = drift.uv, drift.certain
         self.seen: list[list[Seen]] = [[] for _ in greys]
         self.tracks = 0
 
@@ -91,8 +89,8 @@ class Follower:
 
     Parameters
     ----------
-    finder : Finds
-        Searches a picture, or a part of one.
+    finder, glancer : Finds
+        Search a picture: every pixel of it, and a sixteenth of them.
     refiner : Refines
     decoder : WindowDecoder
     thumbnails : Thumbnails
@@ -106,13 +104,14 @@ class Follower:
     def __init__(
         self,
         finder: Finds,
+        glancer: Finds,
         refiner: Refines,
         decoder: WindowDecoder,
         thumbnails: Thumbnails,
         known: KnownTags,
         boards: Sequence[Board] = (),
     ):
-        self._finder, self._refiner, self._decoder = finder, refiner, decoder
+        self._finder, self._glancer, self._refiner, self._decoder = finder, glancer, refiner, decoder
         self._thumbnails, self._known = thumbnails, known
         self._boards = [board for board in boards if len(board.tag_id) > 1]
 
@@ -136,8 +135,7 @@ class Follower:
         -------
         list of n Seen
         """
-        thumbs = [self._thumbnails.of(grey) for grey in greys]
-        span = _Span(greys, time_s, [self._thumbnails.shift(a, b) for a, b in pairwise(thumbs)])
+        span = _Span(greys, time_s, self._thumbnails.drift(greys))
         self._forward(span, first, last)
         self._backward(span)
         return [joined(parts) for parts in span.seen]
@@ -146,13 +144,16 @@ class Follower:
         tracks: list[Track] = []
         self._take(span, 0, first, tracks)
         self._complete(span, 0, tracks)
-        searched = 0
+        searched = glanced = 0
         for k in range(1, len(span)):
             if k == len(span) - 1:
                 self._take(span, k, last, tracks)
-            elif (areas := _new_parts(span, searched, k)) is not None:
-                self._take(span, k, search(span.greys[k], self._finder, self._refiner, areas), tracks)
-                searched = k
+            elif _search_is_due(span, searched, k):
+                self._take(span, k, self.search(span.greys[k]), tracks)
+                searched = glanced = k
+            elif _glance_is_due(span, glanced, k):
+                self._take(span, k, search(span.greys[k], self._glancer, self._refiner), tracks)
+                glanced = k
             waiting = [track for track in tracks if track.frame != k]
             seen = self._advance(span, k, waiting)
             there = span.seen[k]
@@ -365,22 +366,20 @@ def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:
     return track
 
 
-def _new_parts(span: _Span, searched: int, k: int) -> list[Area] | None:
-    """The parts of frame k that came into view since the frame `searched`; None while they are small."""
+def _search_is_due(span: _Span, searched: int, k: int) -> bool:
+    if not np.all(span.certain[searched + 1 : k + 1]):
+        return bool(span.time_s[k] - span.time_s[searched] >= UNCERTAIN_S)
+    return _new_share(span, searched, k) > SEARCH_SHARE
+
+
+def _glance_is_due(span: _Span, glanced: int, k: int) -> bool:
+    return (
+        bool(span.time_s[k] - span.time_s[glanced] >= GLANCE_S) or _new_share(span, glanced, k) > GLANCE_SHARE
+    )
+
+
+def _new_share(span: _Span, before: int, k: int) -> float:
+    """Part of frame k that was not in view in an earlier frame."""
     height, width = span.greys[k].shape
-    whole = [(0, 0, width, height)]
-    if not all(span.certain[searched + 1 : k + 1]):
-        return whole if span.time_s[k] - span.time_s[searched] >= UNCERTAIN_S else None
-    du, dv = span.drift[k] - span.drift[searched]
-    share = 1.0 - max(1.0 - abs(du) / width, 0.0) * max(1.0 - abs(dv) / height, 0.0)
-    if share < NEW_SHARE:
-        return None
-    areas = []
-    if abs(du) > 0.02 * width:
-        far = int(min(abs(du) + OVERLAP * width, width))
-        areas.append((0, 0, far, height) if du > 0 else (width - far, 0, width, height))
-    if abs(dv) > 0.02 * height:
-        far = int(min(abs(dv) + OVERLAP * width, height))
-        areas.append((0, 0, width, far) if dv > 0 else (0, height - far, width, height))
-    pixels = sum((right - left) * (bottom - top) for left, top, right, bottom in areas)
-    return areas if pixels < 0.8 * width * height else whole
+    du, dv = span.drift[k] - span.drift[before]
+    return 1.0 - max(1.0 - abs(float(du)) / width, 0.0) * max(1.0 - abs(float(dv)) / height, 0.0)

@@ -7,6 +7,7 @@ apart, and costs 0.15 ms for a picture of 1280x960 where decoding it costs 3.7 m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -16,16 +17,18 @@ THUMB_PX = 100
 """Widest thumbnail: 80x60 of 1280x960. Twice that is no surer and costs three times as much."""
 CERTAIN = 0.08
 """Height of the peak of the correlation below which pictures of a textured scene had nothing in common."""
+FAR = 0.25
+"""Part of the picture by which it may have moved on before another picture is compared with."""
 
 
 @dataclass(frozen=True)
-class Shift:
-    """Where the picture went between two frames."""
+class Drift:
+    """Where the picture's content went, from frame to frame."""
 
     uv: np.ndarray
-    """(2,) px that the content moved, right and down; 0 where nothing can be said."""
-    certain: bool
-    """Whether the two pictures show the same scene at all."""
+    """(n, 2) way of the content since the first frame, right and down, px; no step where nothing can be said."""
+    certain: np.ndarray
+    """(n,) bool: whether a frame shows the scene of the frame before at all."""
 
 
 class Thumbnails:
@@ -37,6 +40,7 @@ class Thumbnails:
             self._halvings += 1
         self.size = max(width >> self._halvings, 2), max(height >> self._halvings, 2)
         self._scale = np.array([width / self.size[0], height / self.size[1]])
+        self._extent = np.array([width, height])
         self._window = cv2.createHanningWindow(self.size, cv2.CV_32F)
 
     def of(self, grey: np.ndarray) -> np.ndarray:
@@ -46,11 +50,26 @@ class Thumbnails:
             grey = cv2.resize(grey, (grey.shape[1] // 2, grey.shape[0] // 2), interpolation=cv2.INTER_AREA)
         return cv2.resize(grey, self.size, interpolation=cv2.INTER_AREA).astype(np.float32)
 
-    def shift(self, before: np.ndarray, after: np.ndarray) -> Shift:
-        """How the content of the picture moved between two thumbnails."""
+    def drift(self, greys: Sequence[np.ndarray]) -> Drift:
+        """The way of the picture's content through some frames, (H, W) uint8 each."""
+        thumbs = [self.of(grey) for grey in greys]
+        uv, certain = np.zeros((len(thumbs), 2)), np.ones(len(thumbs), bool)
+        anchor = 0
+        for k in range(1, len(thumbs)):
+            # Against one picture as long as it will do: from frame to frame errors of a pixel or two add up to a drift.
+            step, sure = self._shift(thumbs[anchor], thumbs[k])
+            if anchor < k - 1 and not (sure and np.all(np.abs(step) < FAR * self._extent)):
+                anchor = k - 1
+                step, sure = self._shift(thumbs[anchor], thumbs[k])
+            uv[k], certain[k] = uv[anchor] + step, sure
+            if not sure:
+                anchor = k
+        return Drift(uv, certain)
+
+    def _shift(self, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, bool]:
         # A scene that stands: nothing to transform, and noise cannot pretend to a motion.
         if np.abs(after - before).mean() < 0.5:
-            return Shift(np.zeros(2), True)
-        (u, v), peak = cv2.phaseCorrelate(before, after, self._window)
+            return np.zeros(2), True
+        shift, peak = cv2.phaseCorrelate(before, after, self._window)
         certain = peak > CERTAIN
-        return Shift(np.array([u, v]) * self._scale if certain else np.zeros(2), certain)
+        return (np.array(shift) * self._scale if certain else np.zeros(2)), certain

@@ -161,35 +161,10 @@ def seen_at(
     )
 
 
-Area = tuple[int, int, int, int]
-"""Part of a picture: first column, first row, column and row after the last."""
-
-
-def search(grey: np.ndarray, finder: Finds, refiner: Refines, areas: Sequence[Area] | None = None) -> Seen:
-    """Every tag of a picture, or of some parts of it, refined; sorted by family, id and place."""
-    whole = (0, 0, grey.shape[1], grey.shape[0])
-    rows: list[tuple[str, int, np.ndarray, int, float]] = []
-    for left, top, right, bottom in areas or [whole]:
-        found = finder.find(grey[top:bottom, left:right])
-        for k in range(len(found.tag_id)):
-            uv = found.uv[k] + (left, top)
-            row = (
-                str(found.family[k]),
-                int(found.tag_id[k]),
-                uv,
-                int(found.hamming[k]),
-                float(found.margin[k]),
-            )
-            if not any(row[:2] == other[:2] and _same(uv, other[2]) for other in rows):
-                rows.append(row)
-    family, tag_id = [row[0] for row in rows], [row[1] for row in rows]
-    uv = np.array([row[2] for row in rows]).reshape(-1, 4, 2)
-    hamming, margin = np.array([row[3] for row in rows], int), np.array([row[4] for row in rows], float)
-    return joined([seen_at(grey, refiner, family, tag_id, uv, hamming, margin)])
-
-
-def _same(a: np.ndarray, b: np.ndarray) -> bool:
-    return bool(np.hypot(*(a.mean(axis=0) - b.mean(axis=0))) < SAME_SIDES * sides_px(a))
+def search(grey: np.ndarray, finder: Finds, refiner: Refines) -> Seen:
+    """Every tag of a picture, refined; sorted by family, id and place."""
+    found = finder.find(grey)
+    return joined([seen_at(grey, refiner, found.family, found.tag_id, found.uv, found.hamming, found.margin)])
 
 
 def joined(parts: Sequence[Seen]) -> Seen:
