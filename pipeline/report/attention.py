@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.report import detector
 from pipeline.report.evidence import MOVED_SIGMAS, Timeline
 from pipeline.report.facts import deviation_text, station_text
 from pipeline.report.inputs import ReportInputs
@@ -23,7 +24,7 @@ BRIDGED_WORTH_S = 5.0
 
 SECTION_OF_STAGE = {
     "ingest": "coverage",
-    "detect": "coverage",
+    "detect": "detector",
     "estimate": "quality",
     "track": "coverage",
     "survey": "stations",
@@ -55,6 +56,8 @@ def attention(
         *_of_checks(inputs, words, statistics),
         *_of_network(inputs, words),
         *_of_coverage(inputs, words, timeline),
+        *(Remark(SERIOUS, sentence, "detector") for sentence in detector.shaken(inputs, words)),
+        *(Remark(WORTH, sentence, "detector") for sentence in detector.overstated(inputs, words)),
         *(
             Remark(SERIOUS, words("attention.missing", artefact=k, why=v), "provenance")
             for k, v in inputs.missing.items()

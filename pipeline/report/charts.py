@@ -1,4 +1,4 @@
-"""Figures of the evidence: error budget, coverage over time, residuals."""
+"""Figures of the evidence: error budget, coverage over time, pixel noise, residuals."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ from pipeline.report import numbers, palette
 from pipeline.report.drawing import new_figure
 from pipeline.report.evidence import HISTOGRAM_EDGES, Timeline
 from pipeline.report.units import Units, text_of
+
+CAMERA_MARKERS = ("o", "s", "^", "D", "v")
 
 
 def error_budget(parts: list[tuple[str, float]], units: Units) -> Figure:
@@ -50,6 +52,25 @@ def coverage(timeline: Timeline) -> Figure:
     axes[-1].set_xlabel(
         f"Time from {numbers.utc_text(timeline.start_ns)} [{unit}]; grey: cutting edge not observed, bridged"
     )
+    return figure
+
+
+def pixel_noise(tags: dict[str, list[tuple[float, float, float]]]) -> Figure:
+    """Scatter of each tag's corners over its side, with the prediction as a dash above or below (paper, Fig. 11)."""
+    figure = new_figure(2.5)
+    ax = figure.subplots()
+    for number, (camera, points) in enumerate(tags.items()):
+        side, scatter, predicted = np.array(points).T
+        colour, marker = palette.ACCENTS[number % len(palette.ACCENTS)], CAMERA_MARKERS[number % 5]
+        ax.vlines(side, scatter, predicted, color=palette.RULE, lw=0.8, zorder=1)
+        label = "predicted" if number == 0 else None
+        ax.plot(side, predicted, "_", color=palette.DESIGN, ms=7, mew=1.1, zorder=2, label=label)
+        ax.plot(side, scatter, marker, color=colour, ms=4, zorder=3, label=f"observed, camera {camera}")
+    ax.set_ylim(0, 1.15 * max(max(point[1:]) for points in tags.values() for point in points))
+    ax.margins(x=0.08)
+    ax.set_xlabel("Side of the tag [px]")
+    ax.set_ylabel("Scatter of a corner, RMS [px]")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

@@ -73,8 +73,8 @@ def _count(seconds: np.ndarray, edges: np.ndarray) -> np.ndarray:
 
 
 def coverage(inputs: ReportInputs, words: Words) -> dict[str, Any]:
-    """Tables of the coverage section: by camera, by reason of rejection, gaps, over time."""
-    per_camera, per_reason = [], []
+    """Tables of the coverage section: by camera, gaps, over time."""
+    per_camera = []
     frames = inputs.table("frames")
     for camera in inputs.machine.cameras:
         count = 0 if frames is None else int((frames["camera"] == camera).sum())
@@ -92,8 +92,6 @@ def coverage(inputs: ReportInputs, words: Words) -> dict[str, Any]:
                 "rejected": int((~good).sum()),
             }
         )
-        for reason in sorted(set(status[~good].tolist())):
-            per_reason.append({"camera": camera, "status": reason, "count": int((status == reason).sum())})
     cameras = [
         column("camera", words("columns.camera")),
         column("frames", words("columns.frames"), "", 0),
@@ -102,14 +100,8 @@ def coverage(inputs: ReportInputs, words: Words) -> dict[str, Any]:
         column("accepted", words("columns.accepted"), "", 0),
         column("rejected", words("columns.rejected"), "", 0),
     ]
-    reasons = [
-        column("camera", words("columns.camera")),
-        column("status", words("columns.status")),
-        column("count", words("columns.count"), "", 0),
-    ]
     return {
         "cameras": numbers.table(cameras, per_camera),
-        "reasons": numbers.table(reasons, sorted(per_reason, key=lambda r: (r["camera"], -r["count"]))),
         **_gaps_and_time(inputs, words),
     }
 

@@ -46,6 +46,8 @@ class ReportInputs:
     """By camera; columns time_ns, tag_id and status."""
     log_facts: Mapping[str, Any] = field(default_factory=dict)
     """log.json."""
+    detection: Mapping[str, Any] = field(default_factory=dict)
+    """detection.json."""
     solution: Mapping[str, Any] = field(default_factory=dict)
     """solution.json."""
     survey: Mapping[str, Any] = field(default_factory=dict)

@@ -15,7 +15,7 @@ import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from pipeline.report import charts, evidence, facts, maps, measured, numbers, palette, profiles
+from pipeline.report import charts, detector, evidence, facts, maps, measured, numbers, palette, profiles
 from pipeline.report.attention import attention
 from pipeline.report.drawing import house_style, svg_of
 from pipeline.report.evidence import Timeline
@@ -87,6 +87,7 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
         "error_budget": evidence.error_budget(inputs, units, words),
         "coverage": evidence.coverage(inputs, words),
+        "detector": {"rejected": detector.rejected(inputs, words), **detector.scatter(inputs, words)},
         "quality": evidence.quality(inputs, words),
         "points": maps.points_table(inputs, units, words),
         **evidence.statics(inputs, words),
@@ -221,6 +222,16 @@ def _figures(
             )
         else:
             add("coverage", "frames", None)
+        tags = detector.points(inputs)
+        add(
+            "pixel_noise",
+            "detection.json",
+            (lambda: charts.pixel_noise(tags)) if tags else None,
+            n=sum(len(points) for points in tags.values()),
+            text=", ".join(f"{camera} {len(points)}" for camera, points in tags.items()),
+        )
+        if inputs.detection and not tags:
+            about["pixel_noise"]["why"] = words("page.not_available", why=words("detector.none"))
         histogram = evidence.residual_histogram(inputs)
         if histogram is not None:
             length = inputs.tables["residuals"]["normalised"]

@@ -154,7 +154,7 @@ STAGES = (
     ),
     Stage(
         "report",
-        1,
+        2,
         "writing the report",
         ("ingest", "detect", "estimate", "track", "survey"),
         ("log", "design", "checks"),

@@ -73,7 +73,7 @@ def gather(job: Job) -> ReportInputs:
         except ArtefactError as error:
             missing[name] = str(error)
     facts: dict[str, Any] = {}
-    for file in ("log.json", "solution.json", "survey.json"):
+    for file in ("log.json", "detection.json", "solution.json", "survey.json"):
         try:
             facts[file] = job.read_json(file)
         except ArtefactError as error:
@@ -105,6 +105,7 @@ def gather(job: Job) -> ReportInputs:
             if camera in cameras
         },
         log_facts=facts["log.json"],
+        detection=facts["detection.json"],
         solution=facts["solution.json"],
         survey=facts["survey.json"],
         manifests=manifests,

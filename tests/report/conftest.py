@@ -286,6 +286,7 @@ def made_up_inputs(unit="m", seed=7):
         },
         detections=detections,
         log_facts=copy.deepcopy(LOG_FACTS),
+        detection=copy.deepcopy(DETECTION),
         solution=copy.deepcopy(SOLUTION),
         survey=copy.deepcopy(SURVEY),
         manifests={
@@ -306,6 +307,50 @@ LOG_FACTS = {
         "damaged_chunks": 0,
         "sentence": "The recording ends in the middle of a chunk.",
     },
+}
+
+
+def scatter(ratio, shake_ratio=1.0, **others):
+    """A row of detection.json for corners of 0.02 px predicted noise."""
+    return {
+        "frames": 480,
+        "corners": 1920,
+        "outliers": 0,
+        "scatter_px": 0.02 * ratio,
+        "predicted_px": 0.02,
+        "ratio": ratio,
+        "ratio_low": 0.96 * ratio,
+        "ratio_high": 1.04 * ratio,
+        "lag1": 0.1,
+        "shake_px": 0.01 * shake_ratio,
+        "shake_ratio": shake_ratio,
+        "shake_low": 0.9 * shake_ratio,
+        **others,
+    }
+
+
+def tag_scatter(tag_id, side, ratio, shake_ratio=1.0):
+    return scatter(ratio, shake_ratio, family="tag36h11", tag_id=tag_id, tags=1, side_px=side)
+
+
+DETECTION = {
+    "cameras": {
+        "bench": {
+            "pixel_noise": {
+                "sizes": [
+                    scatter(1.1, low_px=0.0, high_px=25.0, tags=1),
+                    scatter(1.9, low_px=25.0, high_px=50.0, tags=1),
+                ],
+                "tags": [tag_scatter(1, 22.0, 1.1), tag_scatter(2, 41.0, 1.9, 6.0)],
+            }
+        },
+        "stickcam": {
+            "pixel_noise": {
+                "sizes": [scatter(0.3, low_px=100.0, high_px=None, tags=1)],
+                "tags": [tag_scatter(11, 140.0, 0.3)],
+            }
+        },
+    }
 }
 SOLUTION = {
     "iterations": 6,
