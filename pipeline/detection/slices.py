@@ -204,8 +204,11 @@ def columns_of(found: Found, status: np.ndarray, frame: int, time_ns: int) -> di
         "side_px": found.side_px,
         "hamming": found.hamming,
         "margin": found.margin,
+        "how": np.full(n, "searched", object),
         "status": status,
     }
+    for name in ("blur_px", "motion_px", "noise", "contrast", "whole"):
+        columns[name] = np.full(n, np.nan)
     for k in range(4):
         columns[f"u{k}"], columns[f"v{k}"] = found.uv[:, k, 0], found.uv[:, k, 1]
         columns[f"cov{k}_uu"] = found.cov[:, k, 0, 0]
