@@ -73,6 +73,15 @@ def test_a_sound_log_gives_its_tables_and_no_warning(shift, tmp_path):
     assert len(found["frame"]) == 240
 
 
+def test_what_the_still_stretches_say_is_told(shift, tmp_path, monkeypatch):
+    """The sentences themselves are tested with the corners that lead to them."""
+    monkeypatch.setattr(detect, "warnings", lambda camera, stillness: [f"{camera} is noisy"])
+    job = open_job(shift.parent, shift, runs=str(tmp_path))
+    ingested(job)
+    _, watch, _ = detected(job)
+    assert watch.warnings == ["front is noisy", "side is noisy"]
+
+
 def spoiled(shift, folder, spoil, **options):
     """A log like `shift` with something wrong, in a folder of its own."""
     return write_log(folder / "shift.mcap", n=12, spoil=spoil, **options)
