@@ -145,8 +145,8 @@ class DetectionSettings(Section):
     quad_decimate: Annotated[float, Field(ge=1, le=4)] = 1.0
     """1 searches every pixel; 2 is three times faster and loses tags under 25 px."""
     decode_sharpening: Annotated[float, Field(ge=0, le=2)] = 0.5
-    """Of the cells before they are read: 0.5 reads 1 to 5 in a hundred tags under 18 px more than 0.25, and 1 hardly more
-    than 0.5. Decision margins grow with it: 39, 57 and 92 in the median of tags 14 px wide."""
+    """Of the cells before they are read: 0.5 reads 1 to 5 in a hundred tags under 18 px more than 0.25, and 1 hardly
+    more than 0.5. Decision margins grow with it: 39, 57 and 92 in the median of tags 14 px wide."""
     max_hamming: Annotated[int, Field(ge=0, le=2)] = 1
     """Wrong bits that are corrected; in families of short codes (tag16h5, DICT_4X4) none whatever stands here."""
     min_margin: NonNegative = 20.0
