@@ -29,7 +29,7 @@ def corner_bound(view: View, shot: Shot, sigma: float | None = None) -> np.ndarr
     Parameters
     ----------
     view : View
-        How the tag was seen; no shadow, glare, cover or response, which nobody could take into account.
+        How the tag was seen; shadow, glare and covers are left out of account, motion and response count as known.
     shot : Shot
         What came of it.
     sigma : float
@@ -43,6 +43,19 @@ def corner_bound(view: View, shot: Shot, sigma: float | None = None) -> np.ndarr
     sigma = noise(shot) if sigma is None else sigma
     J = _derivatives(view, shot)
     return sigma**2 * np.linalg.inv(J.T @ J)[:8, :8]
+
+
+def ideal_fit(view: View, shot: Shot) -> tuple[np.ndarray, np.ndarray]:
+    """The bound, and the error of one linear least-squares fit on the derivatives at the truth: (8, 8), (8,).
+
+    The fit knows the renderer and weighs all pixels of the print alike. The errors of JPEG are not independent
+    between pixels (what is left of the noise is slow, as is what tells of blurred edges), so such a fit is
+    not at the bound either, and what it attains is what can be asked of one that does not know the code of JPEG.
+    """
+    J = _derivatives(view, shot)
+    inverse = np.linalg.inv(J.T @ J)
+    error = inverse @ (J.T @ (shot.grey - shot.clean)[shot.inside])
+    return noise(shot) ** 2 * inverse[:8, :8], error[:8]
 
 
 def noise(shot: Shot) -> float:
@@ -59,10 +72,13 @@ def _derivatives(view: View, shot: Shot) -> np.ndarray:
     angle = np.deg2rad(view.slope_deg)
     lit = (1 + view.slope * (np.cos(angle) * u + np.sin(angle) * v) / side) * view.exposure
 
+    black, bright = (_light.decode(grey, view.gamma) for grey in (view.black, view.white))
+    contrast = bright - black
+
     def seen(uv: np.ndarray, blur_px: float) -> np.ndarray:
         white, _ = print_light(print_, border, where.moved(uv), FINE)
         white = coarse(_light.blur(replace(view, blur_px=blur_px), white, FINE), FINE)
-        return (lit * (view.black + (view.white - view.black) * white))[shot.inside].astype(float)
+        return _light.encode(lit * (black + contrast * white), view.gamma)[shot.inside].astype(float)
 
     columns = []
     for k in range(8):
@@ -72,5 +88,8 @@ def _derivatives(view: View, shot: Shot) -> np.ndarray:
         columns.append((ends[0] - ends[1]) / (2 * STEP_PX))
     now = seen(shot.uv, view.blur_px)
     columns.append((seen(shot.uv, view.blur_px + STEP_PX) - now) / STEP_PX)
-    columns += [lit[shot.inside], now, u[shot.inside] * now / side, v[shot.inside] * now / side]
+    light = _light.decode(now, view.gamma)
+    per_light = now / (view.gamma * light)  # of the response
+    factors = lit[shot.inside], light, u[shot.inside] * light / side, v[shot.inside] * light / side
+    columns += [per_light * factor for factor in factors]
     return np.array(columns).T

@@ -6,7 +6,7 @@ numbers.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -33,8 +33,7 @@ def texture(shape: tuple[int, int], fine: int, rng: np.random.Generator) -> np.n
 
 def fall(view: View, light: np.ndarray, uv: np.ndarray, fine: int, rng: np.random.Generator) -> np.ndarray:
     """The light with what covers the tag, the slope across it, a shadow's edge and glare; linear in grey values."""
-    if view.gamma != 1:
-        light = 255 * (np.maximum(light, 0) / 255) ** view.gamma
+    light = decode(light, view.gamma)
     if not (view.covered or view.slope or view.shadow != 1 or view.glare):
         return light
     centre, side = uv.mean(axis=0), float(np.linalg.norm(np.roll(uv, -1, 0) - uv, axis=1).max())
@@ -143,3 +142,8 @@ def _line(length: float, angle_deg: float) -> np.ndarray:
 def encode(light: np.ndarray, gamma: float) -> np.ndarray:
     """Grey values of linear light; those over 255 are left for the noise to be added first."""
     return light if gamma == 1 else 255 * (np.maximum(light, 0) / 255) ** (1 / gamma)
+
+
+def decode(grey: Any, gamma: float) -> Any:
+    """Linear light of grey values."""
+    return grey if gamma == 1 else 255 * (np.maximum(grey, 0) / 255) ** gamma
