@@ -117,9 +117,7 @@ def refine(view: View, shot: Shot, start: np.ndarray | None) -> Outcome:
     """The corners after refinement from a start."""
     if start is None:
         return LOST
-    fit = Refiner(shot.intrinsics).refine(
-        shot.grey, np.array([view.family], object), np.array([view.tag_id]), start[None]
-    )
+    fit = Refiner(shot.intrinsics).refine(shot.grey, [view.family], [view.tag_id], start[None])
     reason = str(fit.reason[0])
     if not reason and not (np.all(np.isfinite(fit.cov[0])) and np.linalg.eigvalsh(fit.cov[0])[0] > 0):
         reason = "covariance is none"

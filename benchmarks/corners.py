@@ -16,6 +16,7 @@ import itertools
 import sys
 from collections import Counter
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -33,12 +34,12 @@ BIAS_BAR_PX = 0.02
 NORMALISED_BARS = (0.9, 1.15)
 ENOUGH = 20
 """Corners that must stand for a cell to be judged."""
-HARDER = {
+HARDER: dict[str, dict[str, tuple[float, float]]] = {
     "defocus disc": {"disc_px": (0.8, 1.6)},
     "motion 1 to 3 px": {"motion_px": (1, 3)},
     "motion 3 to 6 px": {"motion_px": (3, 6)},
     "response 2.2": {"gamma": (2.2, 2.2)},
-    "no JPEG": {"quality": (0, 0)},
+    "no JPEG": {},
     "fair weather": {},
 }
 """Beyond what the bars speak of (the last two: below), at 40 to 100 px and 0 to 60 degrees; printed without a bar."""
@@ -123,9 +124,10 @@ def run_harder(name: str, number: int, seed: int) -> list[Trial]:
             view = replace(view, blur_px=rng.uniform(0.5, 0.8), motion_deg=rng.uniform(0, 180))
         if name == "fair weather":
             view = fair_weather(view)
-        for field, (low, high) in HARDER[name].items():
-            drawn = rng.uniform(low, high)
-            view = replace(view, **{field: int(drawn) if field == "quality" else drawn})
+        drawn: dict[str, Any] = {field: rng.uniform(*ends) for field, ends in HARDER[name].items()}
+        if name == "no JPEG":
+            drawn["quality"] = 0
+        view = replace(view, **drawn)
         trials.append(_trial(own, view, rng, finder))
     return trials
 
@@ -273,7 +275,8 @@ def print_worst(trials: list[Trial], number: int) -> None:
         print(
             f"    seed {trial.seed} norm8 {rms(o.whitened()):.1f} ratio {trial.ratio:.1f} RMS {rms(o.error):.3f} "
             f"start {rms(o.start_uv):.3f} blur {v.blur_px:.2f} noise {v.noise:.1f} JPEG {v.quality} "
-            f"contrast {v.white - v.black:.0f} slope {v.slope:.2f} focal {v.lens[0]:.0f} k1 {v.lens[4]:+.2f}"
+            f"contrast {v.white - v.black:.0f} slope {v.slope:.2f} "
+            + (f"focal {v.lens[0]:.0f} k1 {v.lens[4]:+.2f}" if v.lens else "")
         )
 
 

@@ -130,7 +130,8 @@ def draw_figure(
 ) -> None:
     """Recall and corner error over exposure, and one tag of each cell."""
     figure = Figure(figsize=(10, 8.4), layout="constrained")
-    above, below = figure.subfigures(2, 1, height_ratios=(len(LIGHTS), 2.6))
+    halves = figure.add_gridspec(2, 1, height_ratios=(len(LIGHTS), 2.6))
+    above, below = (figure.add_subfigure(halves[k]) for k in (0, 1))
     grid = above.add_gridspec(len(LIGHTS), len(EXPOSURES))
     for row, light in enumerate(LIGHTS):
         for column, exposure in enumerate(EXPOSURES):

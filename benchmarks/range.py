@@ -80,7 +80,7 @@ def frame(
     lens = (focal, focal, width / 2, height / 2, -0.1, 0.01, 0.0005, -0.0005, 0.0)
     background = _light.texture((height, width), 1, rng)
     light = background.astype(float)
-    tags = []
+    tags: list[tuple[View, np.ndarray]] = []
     numbers = rng.permutation(IDS[FAMILY])
     for left in range(0, width - PITCH_PX + 1, PITCH_PX):
         for top in range(0, height - PITCH_PX + 1, PITCH_PX):
@@ -116,7 +116,7 @@ def recall(weather: View, camera: str, angle_deg: float, side_px: float, frames:
         grey, tags, lens = frame(weather, camera, angle_deg, side_px, rng)
         found = finder.find(grey)
         status = judge(found, known, grey.shape, settings)
-        fit = Refiner(lens).refine(grey, found.family, found.tag_id, found.uv)
+        fit = Refiner(lens).refine(grey, found.family.tolist(), found.tag_id.tolist(), found.uv)
         believed = (status == ACCEPTED) & (fit.reason == "")
         truth = {view.tag_id: uv for view, uv in tags}
         for number, uv in zip(found.tag_id[believed], fit.uv[believed]):
