@@ -23,23 +23,19 @@ import math
 import numba
 import numpy as np
 
+from pipeline.detection.straightening import TERMS
+
 PIXEL_VARIANCE = 1.0 / 12.0
-LIGHT = 6
-"""Parameters of the light: offset, gain, offset's slopes, gain's slopes."""
-PLACE = 8
-"""Parameters of the homography."""
-BLUR = 3
-"""Parameters of the blur: its mean variance, and what makes it longer one way (x against y, and diagonally), px²."""
-RESPONSE = LIGHT + PLACE + BLUR
-"""Place of the response q among the parameters."""
-GROUND = RESPONSE + 1
-"""Place of the four grey values that the ground beyond each side (left, right, top, bottom) has more than white."""
-PARAMETERS = GROUND + 4
+# Places of the parameters in one vector: light (offset, gain, the offset's slopes, the gain's slopes; grey values),
+# the homography, the blur (mean variance, and what it has more along x than along y and along one diagonal; px²), the
+# response q, and what the ground beyond the print's left, right, upper and lower end is brighter than white.
+OFFSET, GAIN, PLACE, BLUR, RESPONSE, GROUND, PARAMETERS = 0, 1, 6, 14, 17, 18, 22
 
 REACH = 3.3
 """Sigmas beyond which an edge is not felt: 0.0005 of the contrast."""
 NEAR = 2.1
 """Sigmas from an edge beyond which a pixel tells next to nothing of where it is (3 % of its information)."""
+FLAT, ON_EDGE, AT_END = 0, 1, 2
 MAX_LINES = 24
 """Grid lines within reach of a pixel, each way; more means that the print is a grey blob."""
 
@@ -93,25 +89,6 @@ def _beyond(a):
 
 
 @numba.njit(cache=True, inline="always", fastmath=True, error_model="numpy")
-def ideal_of(x, y, lens):
-    """Where a pixel would be without the lens's distortion: the window's polynomial, (10, 2) with its scale, see `refine`."""
-    u = (x - lens[10, 0]) * lens[11, 0]
-    v = (y - lens[10, 1]) * lens[11, 1]
-    X, Y = x, y
-    k = 0
-    power_u = 1.0
-    for i in range(4):
-        power = power_u
-        for _ in range(4 - i):
-            X += lens[k, 0] * power
-            Y += lens[k, 1] * power
-            power *= v
-            k += 1
-        power_u *= u
-    return X, Y
-
-
-@numba.njit(cache=True, inline="always", fastmath=True, error_model="numpy")
 def _sees_an_edge(cells, n, s, t, reach_s, reach_t, column, row):
     """Whether the cells within reach of a place differ, or the print ends there."""
     left, right = math.floor(s - reach_s), math.floor(s + reach_s)
@@ -124,6 +101,21 @@ def _sees_an_edge(cells, n, s, t, reach_s, reach_t, column, row):
             if cells[j, i] != here:
                 return True
     return False
+
+
+@numba.njit(cache=True, inline="always", fastmath=True, error_model="numpy")
+def _row_of_lens(lens, y, row_x, row_y):
+    """The window's polynomial along one row of pixels: five coefficients for each coordinate."""
+    v = (y - lens[TERMS, 1]) * lens[TERMS + 1, 1]
+    k = 0
+    for i in range(5):
+        row_x[i] = row_y[i] = 0.0
+        power = 1.0
+        for _ in range(5 - i):
+            row_x[i] += lens[k, 0] * power
+            row_y[i] += lens[k, 1] * power
+            power *= v
+            k += 1
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
@@ -151,21 +143,25 @@ def linearise(
     Parameters
     ----------
     grey : (H, W) uint8 array
+        The picture.
     cells : (N, N) float64 array
         The print, 1 white; the first n rows and columns count.
     n : int
+        Cells across the print.
     masked : (N, N) bool array
         Cells that are not to be used.
     any_masked : bool
-    lens : (12, 2) float64 array
-        Polynomial of the distortion over the window; used if `bent`.
+        Whether there are such cells.
+    lens : (TERMS + 2, 2) float64 array
+        Polynomial of the distortion over the window, see `straightening`; used if `bent`.
     bent : bool
+        Whether the lens is one that bends lines.
     G : (3, 3) float64 array
         Undistorted pixel -> print, cells.
     norm : (3,) float64 array
         Centre and half size of the window, px.
     par : (PARAMETERS,) float64 array
-        Light (grey values, slopes per half size), eight zeros, blur (px², the pixel's own included), response.
+        By the places above; slopes per half size, the blur with the pixel's own, the homography's eight unused.
     window : (4,) int array
         x0, y0, x1, y1.
     stride, flat_stride : int
@@ -177,27 +173,35 @@ def linearise(
     r : (m,) float64 array
         Filled: observed minus modelled grey value.
     who : (m, 3) int32 array
-        Filled: number of the cell, and 1 for a pixel on an edge (1 % of the contrast per px), 2 for one at the end of the camera's range;
-        place in the picture, row by row.
+        Filled: number of the cell; `ON_EDGE` for a pixel that feels one (1 % of the contrast per px), `AT_END` for one
+        at the end of the camera's range, else `FLAT`; place in the picture, row by row.
 
     Returns
     -------
-    (int, int)
-        Pixels filled in; pixels left out because their cell is masked.
+    int
+        Pixels filled in.
     """
     w, d, dd, ddd = np.empty(26), np.empty(26), np.empty(26), np.empty(26)
     e, f, ff, fff = np.empty(26), np.empty(26), np.empty(26), np.empty(26)
-    count, left_out = 0, 0
-    vxx, vyy, vxy = par[14] + par[15], par[14] - par[15], par[16]
+    count = 0
+    vxx, vyy, vxy = par[BLUR] + par[BLUR + 1], par[BLUR] - par[BLUR + 1], par[BLUR + 2]
+    row_x, row_y = np.empty(5), np.empty(5)
     q = par[RESPONSE]
     ground = np.zeros(4)
     room = len(r)
     scale = norm[2]
     for y in range(window[1], window[3]):
+        if bent:
+            _row_of_lens(lens, y, row_x, row_y)
         for x in range(window[0], window[2]):
+            lot = x + 2 * y
+            if lot % stride != 0 and lot % flat_stride != 0:
+                continue
             X, Y = float(x), float(y)
             if bent:
-                X, Y = ideal_of(X, Y, lens)
+                u = (x - lens[TERMS, 0]) * lens[TERMS + 1, 0]
+                X += row_x[0] + u * (row_x[1] + u * (row_x[2] + u * (row_x[3] + u * row_x[4])))
+                Y += row_y[0] + u * (row_y[1] + u * (row_y[2] + u * (row_y[3] + u * row_y[4])))
             z = 1.0 / (G[2, 0] * X + G[2, 1] * Y + G[2, 2])
             s = (G[0, 0] * X + G[0, 1] * Y + G[0, 2]) * z
             t = (G[1, 0] * X + G[1, 1] * Y + G[1, 2]) * z
@@ -215,7 +219,7 @@ def linearise(
                 continue
             column, row = int(s), int(t)
             near = _sees_an_edge(cells, n, s, t, NEAR * sigma_s, NEAR * sigma_t, column, row)
-            if (x + 2 * y) % (stride if near else flat_stride) != 0:
+            if lot % (stride if near else flat_stride) != 0:
                 continue
             if any_masked:
                 a, b = min(2.0 * sigma_s, 1.0), min(2.0 * sigma_t, 1.0)
@@ -228,10 +232,9 @@ def linearise(
                     or masked[bottom, left]
                     or masked[bottom, right]
                 ):
-                    left_out += 1
                     continue
             if count >= room:
-                return count, left_out
+                return count
             i0, columns = _weights(s, sigma_s, n, w, d, dd, ddd)
             j0, rows = _weights(t, sigma_t, n, e, f, ff, fff)
             T = Ts = Tt = Tss = Tst = Ttt = Tsst = Tstt = Tsstt = Tsssttt = 0.0
@@ -261,8 +264,8 @@ def linearise(
 
             xm, ym = (X - norm[0]) / scale, (Y - norm[1]) / scale
             bright = T + q * T * (1.0 - T)
-            gain = par[1] + par[4] * xm + par[5] * ym
-            model = par[0] + par[2] * xm + par[3] * ym + gain * bright
+            gain = par[GAIN] + par[4] * xm + par[5] * ym
+            model = par[OFFSET] + par[2] * xm + par[3] * ym + gain * bright
             # Beyond the print the ground shines in through the blur.
             ground[0] = _beyond(-s / sigma_s)
             ground[1] = _beyond((s - n) / sigma_s)
@@ -272,7 +275,7 @@ def linearise(
                 model += par[GROUND + k] * ground[k]
             seen = float(grey[y, x])
             steep = (Ts * sx + Tt * tx) ** 2 + (Ts * sy + Tt * ty) ** 2 > 1e-4
-            mark = 1 if steep else 0
+            mark = ON_EDGE if steep else FLAT
             row_J = J[count]
             if (seen > 253.5 and model > 253.5) or (seen < 0.5 and model < 0.5):
                 # At the end of its range a camera tells no more than that.
@@ -280,7 +283,7 @@ def linearise(
                     row_J[k] = 0.0
                 r[count] = 0.0
                 who[count, 2] = -2
-                who[count, 0], who[count, 1] = row * n + column, 2
+                who[count, 0], who[count, 1] = row * n + column, AT_END
                 count += 1
                 continue
             row_J[0], row_J[1], row_J[2], row_J[3] = 1.0, bright, xm, ym
@@ -288,7 +291,7 @@ def linearise(
             for k in range(4):
                 row_J[GROUND + k] = ground[k]
             if not near:
-                for k in range(LIGHT, GROUND):
+                for k in range(PLACE, GROUND):
                     row_J[k] = 0.0
             else:
                 slope = gain * (1.0 + q * (1.0 - 2.0 * T))
@@ -302,15 +305,15 @@ def linearise(
                 Txx = sx * sx * Tss + 2.0 * sx * tx * Tst + tx * tx * Ttt
                 Tyy = sy * sy * Tss + 2.0 * sy * ty * Tst + ty * ty * Ttt
                 Txy = sx * sy * Tss + (sx * ty + sy * tx) * Tst + tx * ty * Ttt
-                row_J[14] = 0.5 * slope * (Txx + Tyy)
-                row_J[15] = 0.5 * slope * (Txx - Tyy)
-                row_J[16] = slope * Txy
-                row_J[17] = gain * T * (1.0 - T)
+                row_J[BLUR] = 0.5 * slope * (Txx + Tyy)
+                row_J[BLUR + 1] = 0.5 * slope * (Txx - Tyy)
+                row_J[BLUR + 2] = slope * Txy
+                row_J[RESPONSE] = gain * T * (1.0 - T)
             r[count] = seen - model
             who[count, 2] = y * grey.shape[1] + x
             who[count, 0], who[count, 1] = row * n + column, mark
             count += 1
-    return count, left_out
+    return count
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
@@ -321,7 +324,7 @@ def brightness(cells, n, G, X, Y, par):
     t = (G[1, 0] * X + G[1, 1] * Y + G[1, 2]) * z
     sx, sy = (G[0, 0] - s * G[2, 0]) * z, (G[0, 1] - s * G[2, 1]) * z
     tx, ty = (G[1, 0] - t * G[2, 0]) * z, (G[1, 1] - t * G[2, 1]) * z
-    vxx, vyy, vxy = par[14] + par[15], par[14] - par[15], par[16]
+    vxx, vyy, vxy = par[BLUR] + par[BLUR + 1], par[BLUR] - par[BLUR + 1], par[BLUR + 2]
     w, e, d, dd, ddd = np.empty(26), np.empty(26), np.empty(26), np.empty(26), np.empty(26)
     sigma_s = math.sqrt(max(sx * sx * vxx + 2.0 * sx * sy * vxy + sy * sy * vyy, 1e-12))
     sigma_t = math.sqrt(max(tx * tx * vxx + 2.0 * tx * ty * vxy + ty * ty * vyy, 1e-12))

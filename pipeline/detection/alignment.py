@@ -1,0 +1,366 @@
+"""One tag's print laid over the picture by Gauss-Newton steps: compiled, because a shift has millions of them.
+
+First a part of the pixels until a step is short, then all that feel an edge. Cells whose residuals stand out are masked
+with their neighbourhood as soon as the print nearly lies. What is known of blur and response beforehand enters as
+observations of its own, in the same units.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from pipeline.detection.image_model import (
+    BLUR,
+    GAIN,
+    GROUND,
+    OFFSET,
+    PARAMETERS,
+    PIXEL_VARIANCE,
+    PLACE,
+    RESPONSE,
+    linearise,
+)
+from pipeline.detection.integrity import contradicted, mask, neighbours, noise_on_edges, pattern, point
+from pipeline.detection.straightening import bent_back, ideal_of
+
+STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
+
+MAX_CELLS = 16
+COARSE_PIXELS = 450
+"""Pixels on edges for the first steps; 700 took as many steps."""
+FINE_PIXELS = 12_000
+COARSE_STEP_PX = 0.15
+FINE_STEP_PX = 0.05
+"""A step this short ends a stage: what it leaves undone is its square over the blur, 0.002 px."""
+LEAST_VARIANCE = 0.06
+"""px²; cameras that sharpen show edges steeper than a pixel's own 1/12."""
+MISFIT_MOST = 0.2
+"""What neighbouring residuals share, as a part of the print's pattern, at the most. Right prints gave up to 0.22
+(1.5 px of blur, 20 px, 45 degrees), mostly below 0.15; wrong ids from 0.19, mostly above 0.35."""
+MISFIT_MOST_SHARP = 0.45
+"""Where cells are wider than 3.5 sigmas of blur: a wrong id is seen cell by cell there, and dirty prints misfit more."""
+COVERED_MOST = 0.5
+"""Part of the cells that may be masked."""
+CONTRADICTED_MOST = 0.1
+"""Part of the cells, and of those that carry the id, whose middle may be of the wrong brightness."""
+JPEG_SHARE = 1.08
+"""Variance of residuals in the whole picture over that of white noise with the same correlation of neighbours: what
+longer correlations add, measured at JPEG qualities 70 to 95 and noise 1 to 6."""
+
+# Places in the vector of results.
+REASON, BLUR_PX, MOTION_PX, NOISE, CONTRAST, WHOLE, MISFIT_AT, RESPONSE_AT, CORRELATION, RESULTS = range(10)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
+    """Lay one print over the picture.
+
+    Parameters
+    ----------
+    grey : (H, W) uint8 array
+        The picture.
+    cells : (MAX_CELLS, MAX_CELLS) float64 array
+        The print, 1 white; the first n rows and columns count.
+    n, border : int
+        Cells across the print, and across the quad of its corners.
+    lens : (TERMS + 2, 2) float64 array
+        Straightens the window, see `straightening`; used if `bent`.
+    bent : bool
+        Whether the lens bends lines.
+    uv : (4, 2) float64 array
+        Corners to start from, px.
+    prior : (5,) float64 array
+        Blur px, sigma of its variance px², sigma of its streak px², response, sigma of the response.
+    out_uv : (4, 2) float64 array
+        Filled: corners, px.
+    out_cov : (8, 8) float64 array
+        Filled: their covariance, px².
+    out : (RESULTS,) float64 array
+        Filled: by the places above.
+    """
+    lo = 0.5 * (n - border)
+    hi = lo + border
+    quiet = lo if lo <= 1.0 else 0.0
+    height, width = grey.shape
+    out_uv[:] = uv
+    straight = uv.copy()
+    if bent:
+        for k in range(4):
+            straight[k, 0], straight[k, 1] = ideal_of(uv[k, 0], uv[k, 1], lens)
+    area = _area(straight)
+    if not area > 30.0:
+        out[REASON] = TOO_SMALL
+        return
+    H = _homography(straight, lo, hi)
+    cell_px = math.sqrt(area) / border
+    norm, window = _window(H, n, 2.0 + 0.6 * cell_px, width, height)
+    if window[2] - window[0] < 4 or window[3] - window[1] < 4:
+        out[REASON] = CUT
+        return
+    at_border = window[0] == 0 or window[1] == 0 or window[2] == width or window[3] == height
+
+    par = np.zeros(PARAMETERS)
+    par[BLUR] = prior[0] ** 2 + PIXEL_VARIANCE
+    par[RESPONSE] = prior[3]
+    black, white = _first_light(grey, cells, n, lens, bent, H)
+    par[OFFSET], par[GAIN] = black, white - black
+    if par[GAIN] < 4.0:
+        out[REASON] = NO_CONTRAST
+        if 0.5 * (black + white) < 25.0:
+            out[REASON] = UNDER_EXPOSED
+        if 0.5 * (black + white) > 235.0:
+            out[REASON] = OVER_EXPOSED
+        return
+
+    pixels = area * (n / border) ** 2
+    room = int(min(1.5 * FINE_PIXELS, 1.5 * pixels + 100)) + 100
+    J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
+    masked = np.zeros((MAX_CELLS, MAX_CELLS), np.bool_)
+    any_masked = False
+    # Pixels on edges: about three beside each side of each cell.
+    on_edges = min(pixels, 5.0 * n * n * cell_px * prior[0])
+    coarse = max(1, int(on_edges / COARSE_PIXELS))
+    fine = max(1, math.ceil(on_edges / FINE_PIXELS))
+    flat = max(1, int(cell_px * cell_px / 5.0))
+
+    reason = STANDS
+    sigma, share, m, steps, first = 10.0, 1.0, 0, 0, True
+    A = np.zeros((PARAMETERS, PARAMETERS))
+    while True:
+        stride = coarse if first else fine
+        m = linearise(
+            grey, cells, n, masked, any_masked, lens, bent, np.linalg.inv(H), norm, par, window,
+            stride, max(flat, stride), quiet, J, r, who,
+        )  # fmt: skip
+        sigma, edge = noise_on_edges(r, who, m)
+        if m < 40 or edge < 30:
+            reason = CUT if at_border else COVERED
+            break
+        Jm = J[:m]
+        A = Jm.T @ Jm
+        x = _solve(A, Jm.T @ r[:m], par, prior, sigma)
+        step_px = _furthest(H, lo, hi, norm, x)
+        # A step that moves a corner further than a third of a cell left the valley: shorten it.
+        part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
+        step_px *= part
+        x *= part
+        H = _moved(H, norm, x)
+        _change(par, x, cell_px)
+        for k in range(m):
+            for i in range(PARAMETERS):
+                r[k] -= J[k, i] * x[i]
+        steps += 1
+        changed = False
+        if not first or (steps >= 2 and step_px < 0.5):
+            changed, share = mask(r, who, m, n, par, masked)
+            any_masked = any_masked or changed
+        if first and ((step_px < COARSE_STEP_PX and not changed) or steps >= 12):
+            first, steps = False, 0
+        elif not first and ((step_px < FINE_STEP_PX and not changed) or steps >= 6):
+            break
+
+    sigma, _ = noise_on_edges(r, who, m)
+    correlation = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
+    misfit = math.sqrt(correlation) * sigma / max(pattern(J, m, par), 1.0)
+    out[BLUR_PX] = math.sqrt(max(par[BLUR] - PIXEL_VARIANCE, 0.0))
+    out[MOTION_PX] = math.sqrt(24.0 * math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2))
+    out[NOISE], out[CONTRAST], out[WHOLE], out[MISFIT_AT] = sigma, par[GAIN], share, misfit
+    out[RESPONSE_AT], out[CORRELATION] = par[RESPONSE], correlation
+    blur_cells = math.sqrt(par[BLUR]) / cell_px
+    if reason == STANDS:
+        if par[GAIN] < 3.0 * sigma:
+            reason = NO_CONTRAST
+        elif sigma > 0.3 * par[GAIN]:
+            reason = MISFIT
+        elif misfit > (MISFIT_MOST_SHARP if blur_cells < 1.0 / 3.5 else MISFIT_MOST):
+            reason = BLURRED if blur_cells > 0.7 else MISFIT
+        else:
+            every, within = contradicted(grey, cells, n, lens, bent, H, norm, par)
+            if within > CONTRADICTED_MOST * (n - 4) ** 2:
+                reason = MISFIT if share > 0.9 else COVERED
+            elif share < 1.0 - COVERED_MOST or every > CONTRADICTED_MOST * n * n:
+                reason = COVERED
+    if reason == STANDS:
+        _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov)
+        for k in range(4):
+            if not (0.0 <= out_uv[k, 0] <= width - 1 and 0.0 <= out_uv[k, 1] <= height - 1):
+                reason = CUT
+    out[REASON] = reason
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _area(uv):
+    """Area of a convex quad in the order of our corners, px²; 0 of any other."""
+    least = 1e9
+    for k in range(4):
+        a, b, c = uv[k], uv[(k + 1) % 4], uv[(k + 2) % 4]
+        least = min(least, (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0]))
+    if not least > 0.0:
+        return 0.0
+    return 0.5 * abs(
+        (uv[2, 0] - uv[0, 0]) * (uv[3, 1] - uv[1, 1]) - (uv[3, 0] - uv[1, 0]) * (uv[2, 1] - uv[0, 1])
+    )
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _homography(uv, lo, hi):
+    """(3, 3) from the print's coordinates (cells) to undistorted pixels, by four corners."""
+    A, b = np.zeros((8, 8)), np.empty(8)
+    for k in range(4):
+        s, t = lo if k == 0 or k == 3 else hi, lo if k < 2 else hi
+        x, y = uv[k, 0], uv[k, 1]
+        A[2 * k, 0], A[2 * k, 1], A[2 * k, 2], A[2 * k, 6], A[2 * k, 7] = s, t, 1.0, -s * x, -t * x
+        A[2 * k + 1, 3], A[2 * k + 1, 4], A[2 * k + 1, 5] = s, t, 1.0
+        A[2 * k + 1, 6], A[2 * k + 1, 7] = -s * y, -t * y
+        b[2 * k], b[2 * k + 1] = x, y
+    h = np.linalg.solve(A, b)
+    H = np.ones((3, 3))
+    for i in range(8):
+        H[i // 3, i % 3] = h[i]
+    return H
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _window(H, n, slack, width, height):
+    """Middle and half size of the print in undistorted pixels, and the pixels x0, y0, x1, y1 around it."""
+    x0, y0, x1, y1 = 1e9, 1e9, -1e9, -1e9
+    for k in range(4):
+        X, Y = point(H, 0.0 if k == 0 or k == 3 else float(n), 0.0 if k < 2 else float(n))
+        x0, y0, x1, y1 = min(x0, X), min(y0, Y), max(x1, X), max(y1, Y)
+    norm = np.array([0.5 * (x0 + x1), 0.5 * (y0 + y1), 0.5 * max(x1 - x0, y1 - y0)])
+    window = np.array(
+        [
+            int(min(max(x0 - slack, 0.0), width)),
+            int(min(max(y0 - slack, 0.0), height)),
+            int(max(min(x1 + slack + 2.0, width), 0.0)),
+            int(max(min(y1 + slack + 2.0, height), 0.0)),
+        ]
+    )
+    return norm, window
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _first_light(grey, cells, n, lens, bent, H):
+    """Grey values of black and of white: medians over the middles of the cells."""
+    blacks, whites = np.empty(n * n), np.empty(n * n)
+    nb, nw = 0, 0
+    height, width = grey.shape
+    for j in range(n):
+        for i in range(n):
+            x, y = point(H, i + 0.5, j + 0.5)
+            if bent:
+                x, y, _ = bent_back(x, y, lens)
+            if not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0):
+                continue
+            value = grey[int(y + 0.5), int(x + 0.5)]
+            if cells[j, i] > 0.5:
+                whites[nw] = value
+                nw += 1
+            else:
+                blacks[nb] = value
+                nb += 1
+    if nb < 4 or nw < 4:
+        return 0.0, 0.0
+    return np.median(blacks[:nb]), np.median(whites[:nw])
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_prior(A, b, k, difference, sigma, noise):
+    weight = (noise / sigma) ** 2
+    A[k, k] += weight
+    b[k] += weight * difference
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_priors(A, b, par, prior, noise):
+    """What is known beforehand, beside observations whose standard deviation is `noise`."""
+    _add_prior(A, b, BLUR, prior[0] ** 2 + PIXEL_VARIANCE - par[BLUR], prior[1], noise)
+    for k in range(BLUR + 1, BLUR + 3):
+        _add_prior(A, b, k, -par[k], prior[2], noise)
+    _add_prior(A, b, RESPONSE, prior[3] - par[RESPONSE], prior[4], noise)
+    for k in range(GAIN + 1, PLACE):
+        _add_prior(A, b, k, -par[k], 0.3 * par[GAIN] + 1.0, noise)
+    for k in range(GROUND, PARAMETERS):
+        _add_prior(A, b, k, -par[k], par[GAIN], noise)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _solve(A, b, par, prior, noise):
+    """Gauss-Newton step; A is left with the priors in it."""
+    _add_priors(A, b, par, prior, noise)
+    d = np.sqrt(np.diag(A)) + 1e-12
+    scaled = A / d / d.reshape(-1, 1)
+    for i in range(PARAMETERS):
+        scaled[i, i] += 1e-6
+    return np.linalg.solve(scaled, b / d) / d
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _furthest(H, lo, hi, norm, x):
+    """How far a step moves the corner that it moves most, px."""
+    most = 0.0
+    for k in range(4):
+        X, Y = point(H, lo if k == 0 or k == 3 else hi, lo if k < 2 else hi)
+        a, b = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
+        g = a * x[PLACE + 6] + b * x[PLACE + 7]
+        dx = norm[2] * (x[PLACE] * a + x[PLACE + 1] * b + x[PLACE + 2] - a * g)
+        dy = norm[2] * (x[PLACE + 3] * a + x[PLACE + 4] * b + x[PLACE + 5] - b * g)
+        most = max(most, math.sqrt(dx * dx + dy * dy))
+    return most
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _moved(H, norm, x):
+    """The homography after a step, which acts on the window's own coordinates."""
+    W = np.empty((3, 3))
+    for i in range(8):
+        W[i // 3, i % 3] = x[PLACE + i]
+    W[2, 2] = 0.0
+    W += np.eye(3)
+    into = np.array([[1 / norm[2], 0, -norm[0] / norm[2]], [0, 1 / norm[2], -norm[1] / norm[2]], [0, 0, 1.0]])
+    back = np.array([[norm[2], 0, norm[0]], [0, norm[2], norm[1]], [0, 0, 1.0]])
+    return back @ W @ into @ H
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _change(par, x, cell_px):
+    """Light, blur and response after a step, within what there can be."""
+    for i in range(PARAMETERS):
+        if i < PLACE or i >= BLUR:
+            par[i] += x[i]
+    par[BLUR] = min(max(par[BLUR], LEAST_VARIANCE), max(5.0, 0.5 * cell_px * cell_px))
+    streak = math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2)
+    most = max(0.9 * (par[BLUR] - PIXEL_VARIANCE), 0.01)
+    if streak > most:
+        par[BLUR + 1] *= most / streak
+        par[BLUR + 2] *= most / streak
+    par[RESPONSE] = min(max(par[RESPONSE], -0.9), 0.9)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov):
+    """Corners in the picture and their covariance from the last normal matrix, priors and all."""
+    d = np.sqrt(np.diag(A)) + 1e-12
+    scaled = A / d / d.reshape(-1, 1)
+    for i in range(PARAMETERS):
+        scaled[i, i] += 1e-9
+    P = np.linalg.inv(scaled) / d / d.reshape(-1, 1)
+    M = np.zeros((8, 8))
+    for k in range(4):
+        X, Y = point(H, lo if k == 0 or k == 3 else hi, lo if k < 2 else hi)
+        x, y, D = X, Y, np.eye(2)
+        if bent:
+            x, y, D = bent_back(X, Y, lens)
+        out_uv[k, 0], out_uv[k, 1] = x, y
+        a, b = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
+        B = np.zeros((2, 8))
+        B[0, 0], B[0, 1], B[0, 2], B[0, 6], B[0, 7] = a, b, 1.0, -a * a, -a * b
+        B[1, 3], B[1, 4], B[1, 5], B[1, 6], B[1, 7] = a, b, 1.0, -b * a, -b * b
+        M[2 * k : 2 * k + 2] = norm[2] * np.linalg.inv(D) @ B
+    # JPEG leaves errors that neighbouring pixels share; information falls as it does for a series that forgets.
+    inflation = JPEG_SHARE * sigma * sigma * (1.0 + correlation) / (1.0 - correlation)
+    place = np.ascontiguousarray(P[PLACE:BLUR, PLACE:BLUR]) * inflation
+    out_cov[:] = M @ place @ M.T

@@ -1,0 +1,117 @@
+"""What is wrong with a fit: its noise, cells that stand out, cells that say another id. Compiled for `alignment`."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from pipeline.detection.image_model import AT_END, GAIN, OFFSET, ON_EDGE, brightness
+from pipeline.detection.straightening import bent_back
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def point(H, s, t):
+    """Undistorted pixel of a place on the print."""
+    z = 1.0 / (H[2, 0] * s + H[2, 1] * t + H[2, 2])
+    return (H[0, 0] * s + H[0, 1] * t + H[0, 2]) * z, (H[1, 0] * s + H[1, 1] * t + H[1, 2]) * z
+
+
+@numba.njit(cache=True, error_model="numpy")
+def noise_on_edges(r, who, m):
+    """Standard deviation of the residuals on edges, grey values, and how many there are."""
+    edge, square = 0, 0.0
+    for k in range(m):
+        if who[k, 1] == ON_EDGE:
+            edge += 1
+            square += r[k] * r[k]
+    return math.sqrt(max(square / max(edge - 12, 8), 0.1)), edge
+
+
+@numba.njit(cache=True, error_model="numpy")
+def neighbours(r, who, m, sigma):
+    """Correlation of the residuals of pixels beside each other, on edges."""
+    pairs, product = 0, 0.0
+    for k in range(m - 1):
+        if who[k + 1, 2] == who[k, 2] + 1 and who[k, 1] == ON_EDGE and who[k + 1, 1] == ON_EDGE:
+            pairs += 1
+            product += r[k] * r[k + 1]
+    return product / (pairs * sigma * sigma) if pairs > 0 else 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def pattern(J, m, par):
+    """Standard deviation of the modelled print over the pixels used, grey values."""
+    if m == 0:
+        return 0.0
+    mean, square = 0.0, 0.0
+    for k in range(m):
+        mean += J[k, GAIN]
+        square += J[k, GAIN] ** 2
+    mean /= m
+    return par[GAIN] * math.sqrt(max(square / m - mean * mean, 0.0))
+
+
+@numba.njit(cache=True, error_model="numpy")
+def mask(r, who, m, n, par, masked):
+    """Mark cells whose residuals stand out; whether the marks changed, and the share of cells not marked."""
+    rms, number = np.zeros(n * n), np.zeros(n * n)
+    for k in range(m):
+        if who[k, 1] != AT_END:
+            rms[who[k, 0]] += r[k] * r[k]
+            number[who[k, 0]] += 1.0
+    usual = np.empty(n * n)
+    have = 0
+    for c in range(n * n):
+        if number[c] > 0:
+            rms[c] = math.sqrt(rms[c] / number[c])
+            if number[c] >= 3:
+                usual[have] = rms[c]
+                have += 1
+    if have < 8:
+        return False, 0.0
+    middle = max(np.median(usual[:have]), 0.8)
+    changed, kept = False, 0
+    for j in range(n):
+        for i in range(n):
+            c = j * n + i
+            if masked[j, i]:
+                continue
+            # Of few pixels the rms itself is uncertain.
+            limit = middle * (3.0 + 4.0 / math.sqrt(max(number[c], 1.0))) + 0.02 * par[GAIN]
+            if number[c] > 0 and rms[c] > limit:
+                masked[j, i] = True
+                changed = True
+            else:
+                kept += 1
+    return changed, kept / (n * n)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def contradicted(grey, cells, n, lens, bent, H, norm, par):
+    """Cells, masked or not, whose middle is not as bright as it should be: of all, and of those that carry the id."""
+    height, width = grey.shape
+    G = np.linalg.inv(H)
+    every, within = 0, 0
+    for j in range(n):
+        for i in range(n):
+            X, Y = point(H, i + 0.5, j + 0.5)
+            x, y = X, Y
+            if bent:
+                x, y, _ = bent_back(X, Y, lens)
+            if not (0.0 <= x < width - 1.0 and 0.0 <= y < height - 1.0):
+                continue
+            left, top = int(x), int(y)
+            a, b = x - left, y - top
+            seen = (1 - b) * ((1 - a) * grey[top, left] + a * grey[top, left + 1]) + b * (
+                (1 - a) * grey[top + 1, left] + a * grey[top + 1, left + 1]
+            )
+            T = brightness(cells, n, G, X, Y, par)
+            u, v = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
+            model = par[OFFSET] + par[2] * u + par[3] * v + (par[GAIN] + par[4] * u + par[5] * v) * T
+            if abs(seen - min(model, 255.0)) > 0.4 * par[GAIN]:
+                every += 1
+                if 2 <= i < n - 2 and 2 <= j < n - 2:
+                    within += 1
+    return every, within
