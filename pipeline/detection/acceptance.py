@@ -10,6 +10,8 @@ from pipeline.config.site import DetectionSettings
 from pipeline.detection.found import Found
 from pipeline.detection.noise import widths_across
 from pipeline.detection.prints import hamming_limit
+from pipeline.detection.refine import MISFIT, NO_CONTRAST
+from pipeline.detection.seen import Seen
 
 ACCEPTED = "accepted"
 UNKNOWN_ID = "unknown id"
@@ -31,13 +33,15 @@ KnownTags = Mapping[str, Set[int]]
 """Family -> ids that machine.toml and site.toml describe."""
 
 
-def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: DetectionSettings) -> np.ndarray:
+def judge(
+    found: Found | Seen, known: KnownTags, shape: tuple[int, int], settings: DetectionSettings
+) -> np.ndarray:
     """The status of each tag: ``accepted``, or the reason why not.
 
     Parameters
     ----------
-    found : Found
-        n tags of one picture.
+    found : Found or Seen
+        n tags of one picture, as a search found them or as the refinement left them; the refinement gives its reasons.
     known : mapping
         Family -> ids that are described.
     shape : (int, int)
@@ -52,14 +56,16 @@ def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: Dete
     status = np.full(len(found), ACCEPTED, object)
     if not len(found):
         return status
-    limits = np.array([shape[1], shape[0]]) - 1 - BORDER_PX
-    touching = np.any((found.uv < BORDER_PX) | (found.uv > limits), axis=(1, 2))
     described = np.array(
         [int(number) in known.get(family, ()) for family, number in zip(found.family, found.tag_id)]
     )
     # From the mildest reason to the gravest: the gravest is the one that is told.
-    status[touching] = BORDER
-    status[widths_across(found.uv).min(axis=1) < MIN_WIDTH_PX] = TOO_SMALL
+    if isinstance(found, Seen):
+        status = np.where(found.reason == "", status, found.reason)
+    else:
+        limits = np.array([shape[1], shape[0]]) - 1 - BORDER_PX
+        status[np.any((found.uv < BORDER_PX) | (found.uv > limits), axis=(1, 2))] = BORDER
+        status[widths_across(found.uv).min(axis=1) < MIN_WIDTH_PX] = TOO_SMALL
     status[_doubled(found, settings)] = TWICE
     status[found.margin < settings.min_margin] = LOW_MARGIN
     status[found.hamming > hamming_limits(found, settings)] = BIT_ERRORS
@@ -67,21 +73,25 @@ def judge(found: Found, known: KnownTags, shape: tuple[int, int], settings: Dete
     return status
 
 
-def hamming_limits(found: Found, settings: DetectionSettings) -> np.ndarray:
+def hamming_limits(found: Found | Seen, settings: DetectionSettings) -> np.ndarray:
     """(n,) int, bits that may have been corrected in each tag: fewer than the settings say where codes are short."""
     return np.array([min(settings.max_hamming, hamming_limit(family)) for family in found.family], int)
 
 
-def _doubled(found: Found, settings: DetectionSettings) -> np.ndarray:
+def _doubled(found: Found | Seen, settings: DetectionSettings) -> np.ndarray:
     """Whether another tag of the same family and id is in the picture: then neither can be told apart.
 
     The two files never describe a tag twice, so there are no two that belong there. A poor decoding does not count:
     it is more likely a mistake than a second print. Poor is what would be refused by itself, and also what had bits
     corrected and not half the margin of one that had none; that one is refused and the other stays. By margin alone
     nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
+    What the refinement cannot lay the print over is no second print either.
     """
     doubled = np.zeros(len(found), bool)
-    sound = (found.margin >= settings.min_margin) & (found.hamming <= hamming_limits(found, settings))
+    # A tag that was followed has no margin.
+    sound = ~(found.margin < settings.min_margin) & (found.hamming <= hamming_limits(found, settings))
+    if isinstance(found, Seen):
+        sound &= (found.reason != MISFIT) & (found.reason != NO_CONTRAST)
     places: dict[tuple[str, int], list[int]] = {}
     for k in np.flatnonzero(sound).tolist():
         places.setdefault((found.family[k], int(found.tag_id[k])), []).append(k)

@@ -155,13 +155,8 @@ class Follower:
                 self._take(span, k, search(span.greys[k], self._glancer, self._refiner), tracks)
                 glanced = k
             waiting = [track for track in tracks if track.frame != k]
-            seen = self._advance(span, k, waiting)
-            there = span.seen[k]
-            new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
-            span.seen[k].append(seen.of(new))
+            ended = _add(span, k, self._advance(span, k, waiting))
             self._complete(span, k, tracks)
-            # Two tracks of one tag: the later one ends.
-            ended = set(seen.track[~new].tolist())
             tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k)]
 
     def _backward(self, span: _Span) -> None:
@@ -176,12 +171,9 @@ class Follower:
                         tracks.append(_track_from(span, k, part, i))
             if not tracks:
                 continue
-            seen = self._advance(span, k - 1, tracks)
-            there = span.seen[k - 1]
-            new = np.array([not any(_among(seen, i, part) for part in there) for i in range(len(seen))], bool)
-            span.seen[k - 1].append(seen.of(new))
+            ended = _add(span, k - 1, self._advance(span, k - 1, tracks))
             self._complete(span, k - 1, tracks)
-            ended = set(seen.track[~new].tolist()) | before
+            ended |= before
             tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k - 1)]
 
     def _take(self, span: _Span, k: int, found: Seen, tracks: list[Track]) -> None:
@@ -271,17 +263,15 @@ class Follower:
         grey = span.greys[k]
         height, width = grey.shape
         there = {
-            (str(part.family[i]), int(part.tag_id[i])): part.uv[i]
+            (str(part.family[i]), int(part.tag_id[i])): (part.uv[i], part.reason[i] == "")
             for part in span.seen[k]
-            for i in np.flatnonzero(part.reason == "").tolist()
+            for i in range(len(part))
         }
         wanted = []
         for board in self._boards:
-            mine = {
-                number: uv for number in board.tag_id if (uv := there.get((board.family, number))) is not None
-            }
-            for tag_id, uv in board.places(mine).items():
-                if np.all((uv > 0) & (uv < (width - 1, height - 1))):
+            mine = {n: there[board.family, n] for n in board.tag_id if (board.family, n) in there}
+            for tag_id, uv in board.places({n: uv for n, (uv, fits) in mine.items() if fits}).items():
+                if tag_id not in mine and np.all((uv > 0) & (uv < (width - 1, height - 1))):
                     wanted.append(Track(-1, board.family, tag_id, uv, k))
         if not wanted:
             return
@@ -346,13 +336,19 @@ def _in_view(track: Track, span: _Span, k: int) -> bool:
     return False
 
 
-def _among(seen: Seen, i: int, others: Seen) -> bool:
-    """Whether tag i stands among others already."""
-    same = (others.tag_id == seen.tag_id[i]) & (others.family == seen.family[i])
-    if not np.any(same):
-        return False
-    away = np.linalg.norm(others.centre[same] - seen.centre[i], axis=1)
-    return bool(away.min() < SAME_SIDES * seen.side_px[i])
+def _add(span: _Span, k: int, seen: Seen) -> set[int]:
+    """Put to frame k what is not there yet; the tracks of the rest, which another track has met, end."""
+    places: dict[tuple[str, int], list[np.ndarray]] = {}
+    for part in span.seen[k]:
+        for i, centre in enumerate(part.centre):
+            places.setdefault((part.family[i], int(part.tag_id[i])), []).append(centre)
+    new = np.zeros(len(seen), bool)
+    for i, (centre, side) in enumerate(zip(seen.centre, seen.side_px)):
+        there = places.setdefault((seen.family[i], int(seen.tag_id[i])), [])
+        new[i] = all(np.hypot(*(centre - other)) > SAME_SIDES * side for other in there)
+        there.append(centre)
+    span.seen[k].append(seen.of(new))
+    return set(seen.track[~new].tolist())
 
 
 def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:

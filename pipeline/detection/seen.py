@@ -8,6 +8,9 @@ from typing import Protocol
 
 import numpy as np
 
+from pipeline.detection.found import Found
+from pipeline.detection.refine import Refined
+
 SEARCHED = "searched"
 FOLLOWED = "followed"
 NO_TRACK = -1
@@ -18,17 +21,7 @@ SAME_SIDES = 0.4
 class Finds(Protocol):
     """Every tag of a picture; see `pipeline.detection.apriltag.TagFinder`."""
 
-    def find(self, grey: np.ndarray) -> FoundTags: ...
-
-
-class FoundTags(Protocol):
-    """What a search gives; see `pipeline.detection.apriltag.Found`."""
-
-    family: np.ndarray
-    tag_id: np.ndarray
-    uv: np.ndarray
-    hamming: np.ndarray
-    margin: np.ndarray
+    def find(self, grey: np.ndarray) -> Found: ...
 
 
 class Refines(Protocol):
@@ -36,21 +29,7 @@ class Refines(Protocol):
 
     def refine(
         self, grey: np.ndarray, family: Sequence[str], tag_id: Sequence[int], uv: np.ndarray
-    ) -> RefinedTags: ...
-
-
-class RefinedTags(Protocol):
-    """What a refinement gives; see `pipeline.detection.refine.Refined`."""
-
-    uv: np.ndarray
-    cov: np.ndarray
-    blur_px: np.ndarray
-    motion_px: np.ndarray
-    noise: np.ndarray
-    contrast: np.ndarray
-    whole: np.ndarray
-    misfit: np.ndarray
-    reason: np.ndarray
+    ) -> Refined: ...
 
 
 @dataclass(frozen=True)

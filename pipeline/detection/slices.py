@@ -1,69 +1,42 @@
-"""Finding markers in a whole log: slices of time, a process per core, pieces that survive a kill.
+"""Finding markers in one slice of a log, and keeping what was found as a piece.
 
-The frames of each camera are cut into slices of `SLICE_S` seconds. A worker opens the log itself, streams one slice
-out of it and writes what it finds as one piece, whole or not at all; pieces that are there already are not made
-again. Slices depend on nothing but the log, so any number of workers gives the same pieces.
-
-Processes are spawned, never forked (OpenCV keeps locks), have one thread each, and are replaced now and then
-(the AprilTag library loses some memory with every picture).
+A piece is written whole or not at all; pieces that are there already are not made again. What goes on in several
+processes is `pipeline.detection.workers`.
 """
 
 from __future__ import annotations
 
-import contextlib
 import json
-import multiprocessing
-import os
-import signal
-import threading
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 
 from pipeline import tables
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import KnownTags, judge
-from pipeline.detection.apriltag import Found, TagFinder
+from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
+from pipeline.detection.follow import Follower
+from pipeline.detection.motion import Thumbnails
+from pipeline.detection.refine import Refiner
+from pipeline.detection.seen import Seen
+from pipeline.detection.spans import Slice, spans_of
+from pipeline.detection.windows import WindowDecoder
 from pipeline.errors import ArtefactError, DetectionError
 from pipeline.logs.container import Contents
-from pipeline.logs.reader import Frame, LogReader, read_log
-
-SLICE_S = 25.0
-"""What a kill costs at most, per worker; short enough for that, long enough to make opening the log cheap."""
-SLICES_PER_PROCESS = 40
-LOST_WORKERS = 3
-"""Times in a row that a worker may vanish without a slice getting done in between."""
+from pipeline.logs.reader import Frame, LogReader
 
 SEARCHED = "searched"
 CORRUPT = "corrupt picture"
 WRONG_SIZE = "wrong size"
 MISSING = "not found again"
+LOST = "lost with a worker"
 
-
-@dataclass(frozen=True)
-class Slice:
-    """Some frames of one camera, neighbours in time."""
-
-    camera: str
-    topic: str
-    number: int
-    """Of the slice among those of its camera."""
-    frame: np.ndarray
-    """(n,) frame numbers."""
-    time_ns: np.ndarray
-    """(n,) capture stamps."""
-    log_time_ns: np.ndarray
-    """(n,) by which the messages are found again."""
-    piece: Path
-    """File that the result goes to."""
+GLANCE_DECIMATE = 4.0
 
 
 @dataclass(frozen=True)
@@ -77,6 +50,9 @@ class Search:
     sizes: dict[str, tuple[int, int]]
     """Camera -> width and height its pictures must have."""
     settings: DetectionSettings
+    intrinsics: dict[str, tuple[float, ...]] = field(default_factory=dict)
+    """Camera -> nine numbers; without them the lens is taken to draw straight lines."""
+    boards: tuple[Board, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,131 +65,109 @@ class Piece:
     """Frames by what became of them: searched, corrupt picture, ..."""
 
 
-def slices_of(frames: dict[str, np.ndarray], topics: dict[str, str], folder: Path) -> list[Slice]:
-    """The frames of a log (columns of the table `frames`) in slices, by camera and time."""
-    found = []
-    for camera, topic in topics.items():
-        mine = np.flatnonzero(frames["camera"] == camera)
-        time_ns = frames["time_ns"][mine]
-        if not len(mine):
-            continue
-        bins = (time_ns - time_ns[0]) // int(SLICE_S * 1e9)
-        starts = np.flatnonzero(np.diff(bins, prepend=-1))
-        for number, rows in enumerate(np.split(mine, starts[1:])):
-            piece = folder / camera / f"{number:06d}.parquet"
-            frame, stamp, received = (frames[name][rows] for name in ("frame", "time_ns", "log_time_ns"))
-            found.append(Slice(camera, topic, number, frame, stamp, received, piece))
-    return found
+class Finders:
+    """The searches and refinements that one process needs, made as its slices ask for them."""
 
+    def __init__(self, search: Search):
+        self._search = search
+        settings = search.settings
+        coarse = max(GLANCE_DECIMATE, settings.quad_decimate)
+        self._finder = TagFinder(search.families, settings)
+        self._glancer = TagFinder(search.families, settings.model_copy(update={"quad_decimate": coarse}))
+        self._decoder = WindowDecoder(settings)
+        self._followers: dict[str, Follower] = {}
 
-def search_slices(
-    search: Search, slices: Sequence[Slice], workers: int, done: Callable[[Slice], None] | None = None
-) -> None:
-    """Write the piece of every slice that has none yet.
-
-    Parameters
-    ----------
-    search : Search
-        What every slice needs.
-    slices : sequence of Slice
-        In the order in which they are to be done.
-    workers : int
-        Processes; with 1 the work is done in this one.
-    done : callable
-        Told each slice when its piece is there, also those that were there before.
-
-    Raises
-    ------
-    DetectionError
-        Workers vanish again and again.
-    ArtefactError
-        A piece cannot be written.
-    """
-    report = done or (lambda _: None)
-    waiting = []
-    for part in slices:
-        if _is_whole(part):
-            report(part)
-        else:
-            part.piece.parent.mkdir(parents=True, exist_ok=True)
-            waiting.append(part)
-    if workers <= 1 or len(waiting) <= 1:
-        with read_log(search.log, search.contents) as reader:
-            finder = TagFinder(search.families, search.settings)
-            for part in waiting:
-                write_piece(part, search_slice(part, search, reader, finder))
-                report(part)
-        return
-    lost = 0
-    while waiting:
-        left = _search_in_processes(search, waiting, workers, report)
-        lost = lost + 1 if len(left) == len(waiting) else 1
-        waiting = left
-        if waiting and lost >= LOST_WORKERS:
-            raise DetectionError(
-                f"a process that searches for markers was killed {lost} times (memory?) at frame "
-                f"{waiting[0].frame[0]} of camera '{waiting[0].camera}'; free some memory or give fewer --workers"
+    def follower(self, camera: str) -> Follower:
+        """Follows the tags in the frames of one camera."""
+        if camera not in self._followers:
+            intrinsics = self._search.intrinsics.get(camera)
+            self._followers[camera] = Follower(
+                self._finder,
+                self._glancer,
+                Refiner(None if intrinsics is None else np.array(intrinsics)),
+                self._decoder,
+                Thumbnails(*self._search.sizes[camera]),
+                self._search.known,
+                self._search.boards,
             )
+        return self._followers[camera]
 
 
-def search_slice(part: Slice, search: Search, reader: LogReader, finder: TagFinder) -> Piece:
+def search_slice(part: Slice, search: Search, reader: LogReader, finders: Finders) -> Piece:
     """Every tag of one slice with its status."""
+    follower = finders.follower(part.camera)
     outcomes: Counter[str] = Counter()
-    rows: list[dict[str, Any]] = []
-    for number, frame in frames_of(part, reader):
-        try:
-            grey = decode_grey(frame.data, frame.encoding, frame.width, frame.height)
-        except DetectionError:
-            outcomes[CORRUPT] += 1
+    rows: list[dict[str, np.ndarray]] = []
+    key: tuple[int, Seen] | None = None
+    spans = part.spans()
+    after: list[int | None] = [*(span[0] for span in spans[1:]), part.ahead[0] if part.ahead else None]
+    for next_key, frames in zip(after, spans_of(part, reader)):
+        # The key that ends a span begins the next one, and is counted and written there.
+        pictures: list[tuple[int, int, np.ndarray]] = []
+        for number, frame in frames:
+            grey, outcome = _picture(frame, search.sizes[part.camera])
+            outcomes[outcome] += number != next_key
+            if grey is not None:
+                pictures.append((number, frame.time_ns, grey))
+        if not pictures:
             continue
-        if grey.shape[::-1] != search.sizes[part.camera]:
-            outcomes[WRONG_SIZE] += 1
-            continue
-        outcomes[SEARCHED] += 1
-        found = finder.find(grey)
-        status = judge(found, search.known, grey.shape, search.settings)
-        rows.append(columns_of(found, status, number, frame.time_ns))
+        seen, key = _follow(follower, pictures, key)
+        for (number, time_ns, grey), tags in zip(pictures, seen):
+            if number != next_key:
+                status = judge(tags, search.known, grey.shape, search.settings)
+                rows.append(columns_of(tags, status, number, time_ns))
     if missing := len(part.frame) - sum(outcomes.values()):
         outcomes[MISSING] = missing
-    rows.sort(key=lambda one: int(one["frame"][0]) if len(one["frame"]) else -1)
     columns = tables.empty_columns("detections")
     if rows:
         columns = {name: np.concatenate([one[name] for one in rows]) for name in columns}
-    return Piece(columns, {name: outcomes[name] for name in sorted(outcomes)})
+    return Piece(columns, {name: outcomes[name] for name in sorted(outcomes) if outcomes[name]})
 
 
-def frames_of(part: Slice, reader: LogReader) -> Iterator[tuple[int, Frame]]:
-    """(frame number, frame) of a slice, in the order of the file."""
-    keys = zip(part.time_ns.tolist(), part.log_time_ns.tolist())
-    waiting = dict(zip(keys, part.frame.tolist()))
-    span = int(part.log_time_ns.min()), int(part.log_time_ns.max()) + 1
-    for frame in reader.frames({part.camera: part.topic}, *span):
-        number = waiting.pop((frame.time_ns, frame.log_time_ns), None)
-        if number is not None:  # else a repeated stamp, or a frame of a neighbouring slice
-            yield number, frame
+def _follow(
+    follower: Follower, pictures: list[tuple[int, int, np.ndarray]], key: tuple[int, Seen] | None
+) -> tuple[list[Seen], tuple[int, Seen]]:
+    """What is seen in each picture (frame number, stamp, grey values) of a span; and its last frame with what a search
+    of it found, which the next span begins with.
+    """
+    greys = [grey for _, _, grey in pictures]
+    first = key[1] if key and key[0] == pictures[0][0] else follower.search(greys[0])
+    if len(greys) == 1:
+        return [first], (pictures[0][0], first)
+    last = follower.search(greys[-1])
+    time_s = np.array([time_ns - pictures[0][1] for _, time_ns, _ in pictures]) / 1e9
+    return follower.follow(greys, time_s, first, last), (pictures[-1][0], last)
 
 
-def columns_of(found: Found, status: np.ndarray, frame: int, time_ns: int) -> dict[str, np.ndarray]:
+def _picture(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray | None, str]:
+    try:
+        grey = decode_grey(frame.data, frame.encoding, frame.width, frame.height)
+    except DetectionError:
+        return None, CORRUPT
+    return (grey, SEARCHED) if grey.shape[::-1] == size else (None, WRONG_SIZE)
+
+
+def columns_of(seen: Seen, status: np.ndarray, frame: int, time_ns: int) -> dict[str, np.ndarray]:
     """Rows of the table `detections` for one frame."""
-    n = len(found)
+    n = len(seen)
     columns: dict[str, np.ndarray] = {
         "frame": np.full(n, frame, np.int32),
         "time_ns": np.full(n, time_ns, np.int64),
-        "family": found.family,
-        "tag_id": found.tag_id,
-        "side_px": found.side_px,
-        "hamming": found.hamming,
-        "margin": found.margin,
-        "how": np.full(n, "searched", object),
+        "family": seen.family,
+        "tag_id": seen.tag_id.astype(np.int32),
+        "side_px": seen.side_px,
+        "hamming": seen.hamming.astype(np.int32),
+        "margin": seen.margin,
+        "how": seen.how,
         "status": status,
     }
     for name in ("blur_px", "motion_px", "noise", "contrast", "whole"):
-        columns[name] = np.full(n, np.nan)
+        columns[name] = np.where(seen.reason == "", getattr(seen, name), np.nan)
     for k in range(4):
-        columns[f"u{k}"], columns[f"v{k}"] = found.uv[:, k, 0], found.uv[:, k, 1]
-        columns[f"cov{k}_uu"] = found.cov[:, k, 0, 0]
-        columns[f"cov{k}_uv"] = found.cov[:, k, 0, 1]
-        columns[f"cov{k}_vv"] = found.cov[:, k, 1, 1]
+        columns[f"u{k}"], columns[f"v{k}"] = seen.uv[:, k, 0], seen.uv[:, k, 1]
+        columns[f"cov{k}_uu"] = seen.cov[:, 2 * k, 2 * k]
+        columns[f"cov{k}_uv"] = seen.cov[:, 2 * k, 2 * k + 1]
+        columns[f"cov{k}_vv"] = seen.cov[:, 2 * k + 1, 2 * k + 1]
     return columns
 
 
@@ -224,11 +178,11 @@ def write_piece(part: Slice, piece: Piece) -> None:
 
 def read_piece(part: Slice) -> Piece:
     """The kept result of a slice. Raises ArtefactError."""
-    frames = json.loads(tables.table_metadata(part.piece)["frames"])
-    return Piece(tables.read_table(part.piece, "detections"), frames)
+    return Piece(tables.read_table(part.piece, "detections"), _frames(part))
 
 
-def _is_whole(part: Slice) -> bool:
+def is_whole(part: Slice) -> bool:
+    """Whether the piece of a slice is there and can be read."""
     if not part.piece.exists():
         return False
     try:
@@ -237,92 +191,24 @@ def _is_whole(part: Slice) -> bool:
         return False
 
 
-_ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+def give_up(part: Slice) -> None:
+    """Keep an empty piece of a slice that ends the processes that work on it. Raises ArtefactError."""
+    write_piece(part, Piece(tables.empty_columns("detections"), {LOST: len(part.frame)}))
 
 
-@contextlib.contextmanager
-def _single_threaded_children() -> Iterator[None]:
-    # They read these while they import numpy, which is before any of our code can run in them.
-    before = {name: os.environ.get(name) for name in _ONE_THREAD}
-    os.environ.update(dict.fromkeys(_ONE_THREAD, "1"))
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+def given_up(slices: Iterable[Slice]) -> list[Slice]:
+    """Those slices that were given up. Raises ArtefactError."""
+    return [part for part in slices if LOST in _frames(part)]
 
 
-@contextlib.contextmanager
-def _interrupts_held() -> Iterator[None]:
-    # A child is born with this mask: Ctrl-C cannot print its traceback before `_start_worker` runs in it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+def _frames(part: Slice) -> dict[str, int]:
+    frames: dict[str, int] = json.loads(tables.table_metadata(part.piece)["frames"])
+    return frames
 
 
-def _search_in_processes(
-    search: Search, slices: Sequence[Slice], workers: int, report: Callable[[Slice], None]
-) -> list[Slice]:
-    """Work through slices with a pool; those left undone because a worker vanished."""
-    undone = {(part.camera, part.number): part for part in slices}
-    with _single_threaded_children():
-        pool = ProcessPoolExecutor(
-            max_workers=min(workers, len(slices)),
-            mp_context=multiprocessing.get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(search,),
-            max_tasks_per_child=SLICES_PER_PROCESS,
-        )
-        futures: dict[Future[None], Slice] = {}
-        ahead = iter(slices)
-        try:
-            while True:
-                # Few are handed over at a time: what is queued is pickled and cannot be called back.
-                while len(futures) < 2 * workers and (part := next(ahead, None)) is not None:
-                    with _interrupts_held():
-                        futures[pool.submit(_work, part)] = part
-                if not futures:
-                    return list(undone.values())
-                for future in wait(futures, return_when=FIRST_COMPLETED).done:
-                    part = futures.pop(future)
-                    future.result()
-                    del undone[part.camera, part.number]
-                    report(part)
-        except BrokenProcessPool:
-            return [part for part in undone.values() if not _is_whole(part)]
-        except BaseException:
-            for child in multiprocessing.active_children():
-                child.terminate()
-            raise
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-_worker: tuple[Search, LogReader, TagFinder] | None = None
-
-
-def _start_worker(search: Search) -> None:
-    global _worker
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's business
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-    cv2.setNumThreads(1)
-    reader = read_log(search.log, search.contents).__enter__()
-    _worker = search, reader, TagFinder(search.families, search.settings)
-
-
-def _end_with_parent() -> None:
-    # A killed parent cannot tell its children; waiting for work they would stay for ever.
-    if parent := multiprocessing.parent_process():
-        parent.join()
-        os._exit(1)
-
-
-def _work(part: Slice) -> None:
-    assert _worker is not None
-    search, reader, finder = _worker
-    write_piece(part, search_slice(part, search, reader, finder))
+def undone(slices: Sequence[Slice]) -> list[Slice]:
+    """Those slices that have no whole piece; folders for the pieces are made."""
+    waiting = [part for part in slices if not is_whole(part)]
+    for part in waiting:
+        part.piece.parent.mkdir(parents=True, exist_ok=True)
+    return waiting

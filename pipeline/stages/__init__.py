@@ -66,12 +66,21 @@ def _reading(job: Job) -> Settings:
 
 
 def _seeing(job: Job) -> Settings:
-    tags: dict[str, list[int]] = {}
-    for marker in [*job.machine.markers.values(), *job.site.benchmarks.values()]:
-        tags.setdefault(marker.family, []).extend(tag.id for tag in marker.tags)
+    markers = [*job.machine.markers.values(), *job.site.benchmarks.values()]
     return {
-        "cameras": {name: camera.topic for name, camera in job.machine.cameras.items()},
-        "tags": {family: sorted(set(ids)) for family, ids in sorted(tags.items())},
+        "cameras": {
+            name: {
+                "topic": camera.topic,
+                # Edges of a print are straight before the lens bends them. Those of the log come with ingest.
+                "intrinsics": camera.intrinsics.vector().tolist() if camera.intrinsics else None,
+            }
+            for name, camera in job.machine.cameras.items()
+        },
+        # Where tags stand on their board tells where to look for them; the order of boards tells nothing.
+        "boards": sorted(
+            [marker.family, *([tag.id, tag.size_m, tag.x_m, tag.y_m] for tag in marker.tags)]
+            for marker in markers
+        ),
         "detection": job.site.detection.model_dump(mode="json"),
     }
 

@@ -1,10 +1,11 @@
-"""detect: every frame searched for tags; `detections/<camera>`."""
+"""detect: tags found and followed through all frames; `detections/<camera>`."""
 
 from __future__ import annotations
 
 import contextlib
 from collections import Counter
 from collections.abc import Sequence
+from datetime import UTC, datetime
 
 import numpy as np
 
@@ -12,21 +13,15 @@ from pipeline import tables
 from pipeline.config.quantities import FAMILIES, dictionary_of, smallest_family
 from pipeline.detection.acceptance import ACCEPTED, UNKNOWN_ID, KnownTags
 from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
 from pipeline.detection.found import Found
 from pipeline.detection.prints import SURE_BITS, spare_bits
-from pipeline.detection.slices import (
-    CORRUPT,
-    SEARCHED,
-    Search,
-    Slice,
-    frames_of,
-    read_piece,
-    search_slices,
-    slices_of,
-)
+from pipeline.detection.slices import CORRUPT, LOST, SEARCHED, Search, given_up, read_piece
+from pipeline.detection.spans import Slice, frames_of, slices_of
 from pipeline.detection.stillness import warnings
 from pipeline.detection.tally import Tally
+from pipeline.detection.workers import search_slices
 from pipeline.errors import DetectionError
 from pipeline.logs.reader import read_log
 from pipeline.stages.job import Counts, Job
@@ -47,12 +42,26 @@ def run(job: Job, progress: Progress) -> Counts:
     cameras = job.read_json("log.json")["cameras"]
     topics = {name: camera["topic"] for name, camera in cameras.items()}
     sizes = {name: (camera["width"], camera["height"]) for name, camera in cameras.items()}
-    slices = slices_of(job.read_table("frames"), topics, job.scratch)
+    slices = slices_of(job.read_table("frames"), topics, sizes, job.scratch)
     with read_log(job.log) as reader:
         contents = reader.contents
-    search = Search(job.log, contents, tuple(sorted(known)), known, sizes, job.site.detection)
+    intrinsics = {
+        name: tuple(camera.intrinsics.vector().tolist())
+        for name, camera in job.calibrated_machine().cameras.items()
+        if camera.intrinsics is not None
+    }
+    search = Search(
+        job.log, contents, tuple(sorted(known)), known, sizes, job.site.detection, intrinsics, boards(job)
+    )
     progress.total(sum(len(part.frame) for part in slices), "frames")
     search_slices(search, slices, job.workers, lambda part: progress.advance(len(part.frame)))
+
+    for part in given_up(slices):
+        start, end = (datetime.fromtimestamp(int(t) / 1e9, UTC) for t in (part.time_ns[0], part.time_ns[-1]))
+        progress.warn(
+            f"camera '{part.camera}': its {len(part.frame)} frames from {start:%Y-%m-%d %H:%M:%S} to "
+            f"{end:%H:%M:%S} UTC ended the process that searched them, twice, and were skipped"
+        )
 
     tallies: dict[str, Tally] = {}
     frames: Counter[str] = Counter()
@@ -89,6 +98,21 @@ def known_tags(job: Job) -> dict[str, frozenset[int]]:
     return {family: frozenset(numbers) for family, numbers in sorted(ids.items())}
 
 
+def boards(job: Job) -> tuple[Board, ...]:
+    """The tags that machine.toml and site.toml say are printed together."""
+    return tuple(
+        Board(
+            marker.family,
+            tuple(tag.id for tag in marker.tags),
+            tuple(tuple((float(x), float(y)) for x, y, _ in tag.corners()) for tag in marker.tags),
+        )
+        for marker in sorted(
+            [*job.machine.markers.values(), *job.site.benchmarks.values()],
+            key=lambda marker: (marker.family, [tag.id for tag in marker.tags]),
+        )
+    )
+
+
 def _join(job: Job, camera: str, slices: Sequence[Slice]) -> Tally:
     """Put the pieces of a camera together and count what is in them."""
     tally = Tally(job.site.detection)
@@ -108,7 +132,7 @@ def _join(job: Job, camera: str, slices: Sequence[Slice]) -> Tally:
 def _judge_pictures(camera: str, frames: Counter[str], progress: Progress) -> None:
     total = sum(frames.values())
     for outcome, count in frames.items():
-        if outcome == SEARCHED or not count:
+        if outcome in (SEARCHED, LOST) or not count:
             continue
         if count > NEARLY_ALL * total:
             raise DetectionError(

@@ -1,25 +1,31 @@
-"""Pieces of work: the same bytes with any number of workers and after any kill."""
+"""Slices: the same bytes with any number of workers, any length of slices and after any kill."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-import pipeline.detection.slices as slices_module
+import pipeline.detection.workers as workers_module
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.slices import Search, read_piece, search_slices, slices_of
+from pipeline.detection.slices import Search, given_up, read_piece
+from pipeline.detection.spans import slices_of
+from pipeline.detection.workers import search_slices
 from pipeline.errors import DetectionError
 from pipeline.logs.reader import read_log
 
 from .conftest import HEIGHT, START, STEP, WIDTH
 
 TOPICS = {"front": "/front/image", "side": "/side/image"}
+SIZES = dict.fromkeys(TOPICS, (WIDTH, HEIGHT))
 KNOWN = {"tag36h11": frozenset({1}), "tag25h9": frozenset({2})}
+SLICE_S = 24.0
 
 
 def frames_table(log: Path) -> dict[str, np.ndarray]:
@@ -37,12 +43,11 @@ def frames_table(log: Path) -> dict[str, np.ndarray]:
 def search_of(log: Path) -> Search:
     with read_log(log) as reader:
         contents = reader.contents
-    sizes = dict.fromkeys(TOPICS, (WIDTH, HEIGHT))
-    return Search(log, contents, ("tag25h9", "tag36h11"), KNOWN, sizes, DetectionSettings())
+    return Search(log, contents, ("tag25h9", "tag36h11"), KNOWN, SIZES, DetectionSettings())
 
 
-def run(log: Path, folder: Path, workers: int) -> list:
-    slices = slices_of(frames_table(log), TOPICS, folder)
+def run(log: Path, folder: Path, workers: int, slice_s: float = SLICE_S) -> list:
+    slices = slices_of(frames_table(log), TOPICS, SIZES, folder, slice_s)
     search_slices(search_of(log), slices, workers)
     return slices
 
@@ -53,12 +58,14 @@ def pieces(folder: Path) -> dict[str, bytes]:
 
 def test_slices_cover_every_frame_once_and_depend_on_time_alone(shift, tmp_path):
     frames = frames_table(shift)
-    slices = slices_of(frames, TOPICS, tmp_path)
+    slices = slices_of(frames, TOPICS, SIZES, tmp_path, SLICE_S)
     for camera in TOPICS:
         mine = [part for part in slices if part.camera == camera]
         assert len(mine) == 3
         assert np.concatenate([part.frame for part in mine]).tolist() == list(range(80))
-        assert all(np.ptp(part.time_ns) < 25e9 for part in mine)
+        assert all(np.ptp(part.time_ns) < SLICE_S * 1e9 for part in mine)
+        assert [part.ahead and part.ahead[0] for part in mine] == [30, 60, None]
+        assert [len(span) for part in mine for span in part.spans()] == [11] * 7 + [10]
 
 
 def test_one_worker_and_two_give_the_same_bytes(shift, tmp_path):
@@ -66,6 +73,19 @@ def test_one_worker_and_two_give_the_same_bytes(shift, tmp_path):
     run(shift, tmp_path / "two", 2)
     assert pieces(tmp_path / "one") == pieces(tmp_path / "two")
     assert len(pieces(tmp_path / "one")) == 6
+
+
+def test_slices_of_any_length_give_the_same_rows(shift, tmp_path):
+    """Tags are followed across spans, so what a slice does not see of its neighbours must not matter."""
+    tables = []
+    for slice_s in (8.0, SLICE_S, 1000.0):
+        slices = run(shift, tmp_path / str(slice_s), 1, slice_s)
+        pieces = [read_piece(part).columns for part in slices]
+        tables.append({name: np.concatenate([one[name] for one in pieces]) for name in pieces[0]})
+    print(len(slices), "slices,", len(tables[0]["frame"]), "rows")
+    for other in tables[1:]:
+        for name, column in tables[0].items():
+            assert column.tobytes() == other[name].tobytes() or column.tolist() == other[name].tolist(), name
 
 
 def test_a_piece_that_is_there_is_not_made_again_and_a_damaged_one_is(shift, tmp_path):
@@ -111,11 +131,11 @@ def _lives(pid: int) -> bool:
         return False
 
 
-def test_a_worker_that_vanishes_again_and_again_is_named(shift, tmp_path, monkeypatch):
+def test_workers_that_vanish_whatever_they_do_end_the_job(shift, tmp_path, monkeypatch):
     """A log that has gone kills each worker as it starts: what a lack of memory looks like from outside."""
-    monkeypatch.setattr(slices_module, "LOST_WORKERS", 1)  # each start of a process takes a second
+    monkeypatch.setattr(workers_module, "LOST_SLICES", 1)  # each start of a process takes a second
     search = search_of(shift)
-    slices = slices_of(frames_table(shift), TOPICS, tmp_path)
+    slices = slices_of(frames_table(shift), TOPICS, SIZES, tmp_path, SLICE_S)
     gone = Search(
         tmp_path / "gone.mcap", search.contents, search.families, KNOWN, search.sizes, search.settings
     )
@@ -123,16 +143,70 @@ def test_a_worker_that_vanishes_again_and_again_is_named(shift, tmp_path, monkey
         search_slices(gone, slices, 2)
 
 
+class Deadly(dict):
+    """A table of sizes that ends the process which asks for the size of one camera's pictures."""
+
+    def __getitem__(self, camera):
+        if camera == "side" and multiprocessing.parent_process() is not None:
+            os._exit(9)
+        return super().__getitem__(camera)
+
+
+class DeadlyOnce(Deadly):
+    """The same, but only the first time, as when memory was short for a moment."""
+
+    def __init__(self, sizes=(), mark=""):
+        super().__init__(sizes)
+        self.mark = mark
+
+    def __reduce__(self):
+        return DeadlyOnce, (dict(self), self.mark)
+
+    def __getitem__(self, camera):
+        if camera == "side" and not Path(self.mark).exists():
+            Path(self.mark).touch()
+            os._exit(9)
+        return dict.__getitem__(self, camera)
+
+
+def test_a_slice_that_ends_its_process_twice_is_skipped_and_the_rest_is_done(shift, tmp_path):
+    search = replace(search_of(shift), sizes=Deadly(SIZES))
+    slices = slices_of(frames_table(shift), TOPICS, SIZES, tmp_path, 1000.0)
+    told = []
+    search_slices(search, slices, 2, told.append)
+    front, side = slices
+    assert given_up(slices) == [side]
+    assert read_piece(front).frames == {"searched": 80}
+    assert read_piece(side).frames == {"lost with a worker": 80}
+    assert np.sum(read_piece(front).columns["status"] == "accepted") == 160
+    assert len(read_piece(side).columns["frame"]) == 0
+    assert sorted(part.camera for part in told) == ["front", "side"]
+
+
+def test_a_worker_that_dies_is_replaced_and_its_slice_repeated(shift, tmp_path):
+    run(shift, tmp_path / "sound", 1, 1000.0)
+    search = replace(search_of(shift), sizes=DeadlyOnce(SIZES, str(tmp_path / "mark")))
+    slices = slices_of(frames_table(shift), TOPICS, SIZES, tmp_path / "died", 1000.0)
+    search_slices(search, slices, 2)
+    assert (tmp_path / "mark").exists()
+    assert given_up(slices) == []
+    assert pieces(tmp_path / "died") == pieces(tmp_path / "sound")
+
+
 def test_what_is_found_is_what_was_drawn(shift, tmp_path):
+    """Both described tags in every frame, searched or followed; the other one where a search comes upon it."""
     for part in run(shift, tmp_path, 1):
         columns = read_piece(part).columns
-        assert columns["frame"].tolist() == np.repeat(part.frame, 3).tolist()
-        for family, tag_id, status in (
-            ("tag36h11", 1, "accepted"),
-            ("tag25h9", 2, "accepted"),
-            ("tag36h11", 9, "unknown id"),
-        ):
+        keys = part.frame[list(part.starts)]
+        for family, tag_id in (("tag36h11", 1), ("tag25h9", 2)):
             rows = (columns["family"] == family) & (columns["tag_id"] == tag_id)
-            assert rows.sum() == len(part.frame)
-            assert set(columns["status"][rows]) == {status}
+            assert columns["frame"][rows].tolist() == part.frame.tolist()
+            assert set(columns["status"][rows]) == {"accepted"}
+            searched = rows & (columns["how"] == "searched")
+            assert set(keys) <= set(columns["frame"][searched])
+            assert np.all(np.isnan(columns["margin"][rows & ~searched]))
+        rows = columns["tag_id"] == 9
+        assert set(keys) <= set(columns["frame"][rows])
+        assert set(columns["status"][rows]) == {"unknown id"}
+        assert set(columns["how"][rows]) == {"searched"}
         assert columns["time_ns"].tolist() == (START + 8 * STEP * columns["frame"].astype(np.int64)).tolist()
