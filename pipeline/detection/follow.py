@@ -34,7 +34,7 @@ from pipeline.detection.seen import (
 )
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
-GLANCE_S = 1.0
+GLANCE_S = 1.5
 """Between two glances: searches of the frame decimated by four. They take a twelfth of a search and miss tags under
 some 40 px; what comes from behind something and goes again within a span is found by them."""
 GLANCE_SHARE = 0.15
@@ -43,7 +43,7 @@ SEARCH_SHARE = 0.6
 """The same for searches of the whole frame."""
 UNCERTAIN_S = 1.0
 """Between searches of the whole frame while the picture's motion cannot be told."""
-DECODER_TRIES = 3
+DECODER_TRIES = 2
 """Frames after a tag was lost in which the decoder looks for it; after them only its correlation tells of it."""
 SURE = 0.6
 """Correlation of a place with which a tag that cannot be refined is still taken to be there, covered or blurred."""
@@ -232,21 +232,17 @@ class Follower:
         parts = [seen.of(told)]
         missing = [t for i, t in enumerate(tracks) if i not in {tried[j] for j in np.flatnonzero(told)}]
         decoded: list[tuple[Track, np.ndarray]] = []
+        height, width = grey.shape
         for track in missing:
-            if track.lost < DECODER_TRIES:
-                place = self._decoder.find(
-                    grey,
-                    track.family,
-                    track.tag_id,
-                    _guesses(track, span, k)[0],
-                    2.0 * _reach_px(track, span, k),
-                )
-                if place is not None:
-                    decoded.append((track, place))
+            place = _guesses(track, span, k)[0]
+            if track.lost >= DECODER_TRIES or not np.all((place > 0) & (place < (width - 1, height - 1))):
+                continue
+            reach = _reach_px(track, span, k)
+            uv_found = self._decoder.find(grey, track.family, track.tag_id, place, reach)
+            if uv_found is not None:
+                decoded.append((track, uv_found))
         if decoded:
-            parts.append(
-                self._refined(grey, [t for t, _ in decoded], np.array([place for _, place in decoded]))
-            )
+            parts.append(self._refined(grey, [t for t, _ in decoded], np.array([uv for _, uv in decoded])))
         seen = joined(parts)
         left = {track.number: track for track in tracks}
         for i, number in enumerate(seen.track.tolist()):

@@ -25,7 +25,7 @@ from .conftest import HEIGHT, START, STEP, WIDTH
 TOPICS = {"front": "/front/image", "side": "/side/image"}
 SIZES = dict.fromkeys(TOPICS, (WIDTH, HEIGHT))
 KNOWN = {"tag36h11": frozenset({1}), "tag25h9": frozenset({2})}
-SLICE_S = 24.0
+SLICE_S = 20.0
 
 
 def frames_table(log: Path) -> dict[str, np.ndarray]:
@@ -78,7 +78,7 @@ def test_one_worker_and_two_give_the_same_bytes(shift, tmp_path):
 def test_slices_of_any_length_give_the_same_rows(shift, tmp_path):
     """Tags are followed across spans, so what a slice does not see of its neighbours must not matter."""
     tables = []
-    for slice_s in (8.0, SLICE_S, 1000.0):
+    for slice_s in (10.0, SLICE_S, 1000.0):
         slices = run(shift, tmp_path / str(slice_s), 1, slice_s)
         pieces = [read_piece(part).columns for part in slices]
         tables.append({name: np.concatenate([one[name] for one in pieces]) for name in pieces[0]})
