@@ -163,7 +163,9 @@ def draw_figure(
         axes.grid(color="#dddddd")
     share.set_ylim(-0.02, 1.05)
     error.set_ylim(bottom=0)
-    share.legend(fontsize=9)
+    below.legend(
+        *share.get_legend_handles_labels(), loc="outside lower center", ncols=len(LIGHTS), fontsize=9
+    )
     figure.savefig(path, dpi=80, metadata={"Software": None})
 
 
