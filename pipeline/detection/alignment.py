@@ -23,7 +23,16 @@ from pipeline.detection.image_model import (
     RESPONSE,
     linearise,
 )
-from pipeline.detection.integrity import contradicted, mask, neighbours, noise_on_edges, pattern, point
+from pipeline.detection.integrity import (
+    contradicted,
+    level,
+    mask,
+    neighbours,
+    noise_on_edges,
+    pattern,
+    point,
+    unevenness,
+)
 from pipeline.detection.straightening import bent_back, ideal_of
 
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
@@ -41,9 +50,14 @@ MISFIT_MOST = 0.2
 """What neighbouring residuals share, as a part of the print's pattern, at the most. Right prints gave up to 0.22
 (1.5 px of blur, 20 px, 45 degrees), mostly below 0.15; wrong ids from 0.19, mostly above 0.35."""
 MISFIT_MOST_SHARP = 0.45
-"""Where cells are wider than 3.5 sigmas of blur: a wrong id is seen cell by cell there, and dirty prints misfit more."""
+"""Where cells are wider than 3.5 sigmas of blur: a wrong id is seen cell by cell there, dirty prints misfit more."""
 COVERED_MOST = 0.5
 """Part of the cells that may be masked."""
+UNEVEN = 4.0
+"""`unevenness` from which each cell gets a brightness of its own; noise and JPEG gave up to 2.8, shadows 20 to 40."""
+UNEVEN_VARIANCE = 4.0
+"""What free brightness of the cells adds to the variance of corners, measured on shadows that pass over tags."""
+UNEVEN_STEPS = 6
 CONTRADICTED_MOST = 0.1
 """Part of the cells, and of those that carry the id, whose middle may be of the wrong brightness."""
 JPEG_SHARE = 1.08
@@ -129,10 +143,11 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
     reason = STANDS
     sigma, share, m, steps, first = 10.0, 1.0, 0, 0, True
     A = np.zeros((PARAMETERS, PARAMETERS))
+    levels, uneven = cells, False
     while True:
         stride = coarse if first else fine
         m = linearise(
-            grey, cells, n, masked, any_masked, lens, bent, np.linalg.inv(H), norm, par, window,
+            grey, levels, n, masked, any_masked, lens, bent, np.linalg.inv(H), norm, par, window,
             stride, max(flat, stride), quiet, J, r, who,
         )  # fmt: skip
         sigma, edge = noise_on_edges(r, who, m)
@@ -141,6 +156,10 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
             break
         Jm = J[:m]
         A = Jm.T @ Jm
+        if uneven:
+            # The cells' own brightness and the light over all of them say the same: the light stays.
+            for k in range(PLACE):
+                A[k, k] += 1e9 * (1.0 + A[k, k])
         x = _solve(A, Jm.T @ r[:m], par, prior, sigma)
         step_px = _furthest(H, lo, hi, norm, x)
         # A step that moves a corner further than a third of a cell left the valley: shorten it.
@@ -155,12 +174,20 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
         steps += 1
         changed = False
         if not first or (steps >= 2 and step_px < 0.5):
-            changed, share = mask(r, who, m, n, par, masked)
+            changed, share = mask(r, who, m, n, par, masked, 2.0 if uneven else 3.0)
             any_masked = any_masked or changed
+        if uneven:
+            level(r, who, m, n, par, masked, levels)
         if first and ((step_px < COARSE_STEP_PX and not changed) or steps >= 12):
             first, steps = False, 0
-        elif not first and ((step_px < FINE_STEP_PX and not changed) or steps >= 6):
+        elif not first and steps >= UNEVEN_STEPS and uneven:
             break
+        elif not first and not uneven and ((step_px < FINE_STEP_PX and not changed) or steps >= 6):
+            # A shadow's edge across the print is no noise: each cell gets a brightness of its own.
+            if unevenness(r, who, m, n, masked) < UNEVEN:
+                break
+            uneven, steps, levels, any_masked = True, 0, cells.copy(), False
+            masked[:] = False
 
     sigma, _ = noise_on_edges(r, who, m)
     correlation = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
@@ -178,11 +205,13 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
         elif misfit > (MISFIT_MOST_SHARP if blur_cells < 1.0 / 3.5 else MISFIT_MOST):
             reason = BLURRED if blur_cells > 0.7 else MISFIT
         else:
-            every, within = contradicted(grey, cells, n, lens, bent, H, norm, par)
+            every, within = contradicted(grey, cells, levels, n, lens, bent, H, norm, par)
             if within > CONTRADICTED_MOST * (n - 4) ** 2:
                 reason = MISFIT if share > 0.9 else COVERED
             elif share < 1.0 - COVERED_MOST or every > CONTRADICTED_MOST * n * n:
                 reason = COVERED
+    if uneven:
+        sigma *= math.sqrt(UNEVEN_VARIANCE)
     if reason == STANDS:
         _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov)
         for k in range(4):

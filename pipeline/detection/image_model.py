@@ -35,8 +35,8 @@ OFFSET, GAIN, PLACE, BLUR, RESPONSE, GROUND, PARAMETERS = 0, 1, 6, 14, 17, 18, 2
 
 REACH = 3.3
 """Sigmas beyond which an edge is not felt: 0.0005 of the contrast."""
-NEAR = 2.1
-"""Sigmas from an edge beyond which a pixel tells next to nothing of where it is (3 % of its information)."""
+NEAR = 2.6
+"""Sigmas from an edge beyond which a pixel tells next to nothing of it; 2.1 saved a fifth and cost 5 % after JPEG."""
 FLAT, ON_EDGE, AT_END = 0, 1, 2
 MAX_LINES = 24
 """Grid lines within reach of a pixel, each way; more means that the print is a grey blob."""

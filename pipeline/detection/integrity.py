@@ -54,8 +54,8 @@ def pattern(J, m, par):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def mask(r, who, m, n, par, masked):
-    """Mark cells whose residuals stand out; whether the marks changed, and the share of cells not marked."""
+def mask(r, who, m, n, par, masked, times):
+    """Mark cells with residuals of `times` the usual; whether the marks changed, and the share of cells not marked."""
     rms, number = np.zeros(n * n), np.zeros(n * n)
     for k in range(m):
         if who[k, 1] != AT_END:
@@ -79,7 +79,7 @@ def mask(r, who, m, n, par, masked):
             if masked[j, i]:
                 continue
             # Of few pixels the rms itself is uncertain.
-            limit = middle * (3.0 + 4.0 / math.sqrt(max(number[c], 1.0))) + 0.02 * par[GAIN]
+            limit = middle * (times + 4.0 / math.sqrt(max(number[c], 1.0))) + 0.02 * par[GAIN]
             if number[c] > 0 and rms[c] > limit:
                 masked[j, i] = True
                 changed = True
@@ -89,7 +89,43 @@ def mask(r, who, m, n, par, masked):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def contradicted(grey, cells, n, lens, bent, H, norm, par):
+def unevenness(r, who, m, n, masked):
+    """Mean square of what cells are too bright or too dark, over what noise leaves; 1 where there is but noise."""
+    total, square, number = np.zeros(n * n), np.zeros(n * n), np.zeros(n * n)
+    for k in range(m):
+        if who[k, 1] != AT_END:
+            c = who[k, 0]
+            total[c] += r[k]
+            square[c] += r[k] * r[k]
+            number[c] += 1.0
+    between, within, cells = 0.0, 0.0, 0
+    for c in range(n * n):
+        if number[c] >= 4 and not masked[c // n, c % n]:
+            mean = total[c] / number[c]
+            between += number[c] * mean * mean
+            within += (square[c] - number[c] * mean * mean) / (number[c] - 1.0)
+            cells += 1
+    return between / max(within, 0.3 * cells) if cells > 0 else 0.0
+
+
+@numba.njit(cache=True, error_model="numpy")
+def level(r, who, m, n, par, masked, levels):
+    """Give each cell the brightness that its pixels show, `levels` (0 black, 1 white) changed in place."""
+    total, number = np.zeros(n * n), np.zeros(n * n)
+    for k in range(m):
+        if who[k, 1] != AT_END:
+            total[who[k, 0]] += r[k]
+            number[who[k, 0]] += 1.0
+    for j in range(n):
+        for i in range(n):
+            c = j * n + i
+            if number[c] >= 4 and not masked[j, i]:
+                # Pixels at a cell's edge show its neighbours too: what is left comes with the next step.
+                levels[j, i] += total[c] / number[c] / par[GAIN]
+
+
+@numba.njit(cache=True, error_model="numpy")
+def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
     """Cells, masked or not, whose middle is not as bright as it should be: of all, and of those that carry the id."""
     height, width = grey.shape
     G = np.linalg.inv(H)
@@ -107,10 +143,10 @@ def contradicted(grey, cells, n, lens, bent, H, norm, par):
             seen = (1 - b) * ((1 - a) * grey[top, left] + a * grey[top, left + 1]) + b * (
                 (1 - a) * grey[top + 1, left] + a * grey[top + 1, left + 1]
             )
-            T = brightness(cells, n, G, X, Y, par)
+            T = brightness(levels, n, G, X, Y, par)
             u, v = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
             model = par[OFFSET] + par[2] * u + par[3] * v + (par[GAIN] + par[4] * u + par[5] * v) * T
-            if abs(seen - min(model, 255.0)) > 0.4 * par[GAIN]:
+            if abs(seen - min(model, 255.0)) > 0.4 * par[GAIN] or abs(levels[j, i] - cells[j, i]) > 0.65:
                 every += 1
                 if 2 <= i < n - 2 and 2 <= j < n - 2:
                     within += 1

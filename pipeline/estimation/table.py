@@ -8,7 +8,6 @@ import numpy as np
 
 from pipeline.estimation.solution import BodyStates, CornerResiduals, StaticResult
 from pipeline.geometry import gaussian, so3
-from pipeline.network.bow import without_bow
 from pipeline.network.model import Network, Observations, Readings
 
 Columns = dict[str, np.ndarray]
@@ -66,7 +65,7 @@ def columns_of_residuals(network: Network, table: CornerResiduals) -> Columns:
 
 
 def observations_of(network: Network, detections: Mapping[str, Mapping[str, np.ndarray]]) -> Observations:
-    """Accepted tags of the ``detections`` tables, one table per camera, as observations, freed of the lens's bow.
+    """Accepted tags of the ``detections`` tables, one table per camera, as observations.
 
     Tags that the network does not have are left out: detection has counted them as unknown.
     """
@@ -86,7 +85,6 @@ def observations_of(network: Network, detections: Mapping[str, Mapping[str, np.n
         )[good]
         camera_index = network.camera_index(name)
         camera = np.full(len(good), camera_index)
-        uv = without_bow(uv, network.statics[network.cameras[camera_index].intrinsics].value)
         parts.append(Observations(camera, index[good], rows["time_ns"][good], uv, cov.reshape(-1, 4, 2, 2)))
     fields = ("camera", "tag", "time_ns", "uv", "cov")
     return Observations(*(np.concatenate([getattr(p, f) for p in parts]) for f in fields))
