@@ -6,6 +6,7 @@ What it does not see it cannot vouch for: a tag that shows in one frame of a tho
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
@@ -49,7 +50,9 @@ class Seen:
     places: dict[str, set[int]] = field(default_factory=dict)
     """Sensor -> at which places it had readings."""
     tags: list[tuple[str, str, int, np.ndarray, np.ndarray, int]] = field(default_factory=list)
-    """camera, family, id, uv (4, 2), cov (4, 2, 2), time_ns of each accepted tag."""
+    """camera, family, id, uv (4, 2), cov (4, 2, 2), time_ns of each accepted tag, described or not."""
+    refused: Counter[tuple[str, int, str]] = field(default_factory=Counter)
+    """Family, id and status of the others."""
     looked_at: dict[str, int] = field(default_factory=dict)
     """Camera -> frames searched."""
 
@@ -199,15 +202,23 @@ def _with_calibrations(reader: LogReader, machine: Machine, source: Source, log:
 
 def _frame_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Finding]:
     """Sizes of the pictures; searches one frame of each place for tags."""
+    from pipeline.config.quantities import FAMILIES
+    from pipeline.detection.acceptance import ACCEPTED, judge
     from pipeline.detection.apriltag import TagFinder
     from pipeline.detection.decode import decode_grey
+    from pipeline.detection.refine import Refiner
+    from pipeline.detection.seen import search
 
-    prints = [*machine.markers.values(), *site.benchmarks.values()]
-    finder = TagFinder({mark.family for mark in prints}, site.detection)
+    families = {mark.family for mark in [*machine.markers.values(), *site.benchmarks.values()]}
+    finder = TagFinder(families, site.detection)
+    # Ids that nobody described are told below; here only whether the tag would be good enough.
+    every_id = {family: frozenset(range(FAMILIES[family])) for family in families}
     for name, frames in seen.frames.items():
         intrinsics = machine.cameras[name].intrinsics
         assert intrinsics is not None
         corrupt, sizes = 0, set()
+        expected = (intrinsics.width, intrinsics.height)
+        refiner = Refiner(intrinsics.vector())
         for frame in frames[::MESSAGES_PER_PLACE]:
             try:
                 grey = decode_grey(frame.data, frame.encoding, frame.width, frame.height)
@@ -215,18 +226,17 @@ def _frame_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Findin
                 corrupt += 1
                 continue
             sizes.add((grey.shape[1], grey.shape[0]))
-            found = finder.find(grey)
+            # The lens of another size of picture is unknown.
+            tags = search(grey, finder, refiner if grey.shape[::-1] == expected else Refiner())
+            status = judge(tags, every_id, grey.shape, site.detection)
             seen.looked_at[name] = seen.looked_at.get(name, 0) + 1
-            for k in np.flatnonzero(found.margin >= site.detection.min_margin).tolist():
-                tag = (
-                    name,
-                    str(found.family[k]),
-                    int(found.tag_id[k]),
-                    found.uv[k],
-                    found.cov[k],
-                    frame.time_ns,
-                )
-                seen.tags.append(tag)
+            for k in range(len(tags)):
+                family, tag_id = str(tags.family[k]), int(tags.tag_id[k])
+                if status[k] == ACCEPTED:
+                    cov = np.array([tags.cov[k, i : i + 2, i : i + 2] for i in (0, 2, 4, 6)])
+                    seen.tags.append((name, family, tag_id, tags.uv[k], cov, frame.time_ns))
+                else:
+                    seen.refused[family, tag_id, str(status[k])] += 1
         if corrupt:
             level: Level = "warning" if sizes else "error"
             number = corrupt + seen.looked_at.get(name, 0)
@@ -235,7 +245,6 @@ def _frame_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Findin
                 f"camera '{name}': {corrupt} of {number} pictures looked at are corrupt; "
                 "check the cable and the recorder's disk",
             )
-        expected = (intrinsics.width, intrinsics.height)
         for size in sorted(sizes - {expected}):
             yield Finding(
                 "error",
@@ -327,6 +336,18 @@ def _tag_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Finding]
             "neither file describes; describe it, or ignore this if it is none of yours",
         )
     if not known:
+        reasons: Counter[str] = Counter()
+        for (family, tag_id, status), number in seen.refused.items():
+            if (family, tag_id) in owner:
+                reasons[status] += number
+        if reasons:
+            what = ", ".join(f"{status} {number}" for status, number in reasons.most_common())
+            yield Finding(
+                "error",
+                f"described tags were found in the frames looked at ({frames}), and not one could be used: {what}; "
+                "see docs/detector.md for what helps",
+            )
+            return
         yield Finding(
             "error",
             f"no described tag was found in the frames looked at ({frames}); check family and ids of the markers, "
