@@ -64,11 +64,15 @@ class Track:
     """(4, 2) velocity of its corners, px/s."""
     lost: int = 0
     """Frames since then."""
+    side_px: float = 0.0
+
+    def __post_init__(self) -> None:
+        self.side_px = float(sides_px(self.uv))
 
     def at(self, uv: np.ndarray, frame: int, seconds: float) -> None:
         """Seen again, so many seconds later (negative on the way back)."""
         self.step = (uv - self.uv) / seconds if self.lost <= 2 and seconds else None
-        self.uv, self.frame, self.lost = uv, frame, 0
+        self.uv, self.frame, self.lost, self.side_px = uv, frame, 0, float(sides_px(uv))
 
 
 class _Span:
@@ -204,7 +208,8 @@ class Follower:
         if not tracks:
             return seen_at(grey, self._refiner, [], [], np.zeros((0, 4, 2)))
         guesses = [_guesses(track, span, k) for track in tracks]
-        uv, score = self._locate(grey, tracks, guesses, [_reach_px(t, span, k) for t in tracks])
+        reach = [_reach_px(track, span, k) for track in tracks]
+        uv, score = self._locate(grey, tracks, guesses, reach)
         strayed = [i for i in range(len(tracks)) if score[i] < SURE and not tracks[i].lost]
         if strayed and len(strayed) < len(tracks):
             # The other tags of the frame say how the camera moved, where the thumbnails could not.
@@ -215,7 +220,7 @@ class Follower:
                 common = np.median(moves, axis=0)
                 again = [[tracks[i].uv + common] for i in strayed]
                 few = [tracks[i] for i in strayed]
-                other, better = self._locate(grey, few, again, [_reach_px(t, span, k) for t in few])
+                other, better = self._locate(grey, few, again, [reach[i] for i in strayed])
                 for j, i in enumerate(strayed):
                     if better[j] > score[i]:
                         uv[i], score[i] = other[j], better[j]
@@ -230,17 +235,17 @@ class Follower:
             bool,
         )
         parts = [seen.of(told)]
-        missing = [t for i, t in enumerate(tracks) if i not in {tried[j] for j in np.flatnonzero(told)}]
+        there = {tried[j] for j in np.flatnonzero(told)}
         decoded: list[tuple[Track, np.ndarray]] = []
         height, width = grey.shape
-        for track in missing:
-            place = _guesses(track, span, k)[0]
-            if track.lost >= DECODER_TRIES or not np.all((place > 0) & (place < (width - 1, height - 1))):
+        for i, track in enumerate(tracks):
+            place = guesses[i][0]
+            if i in there or track.lost >= DECODER_TRIES:
                 continue
-            reach = _reach_px(track, span, k)
-            uv_found = self._decoder.find(grey, track.family, track.tag_id, place, reach)
-            if uv_found is not None:
-                decoded.append((track, uv_found))
+            if np.all((place > 0) & (place < (width - 1, height - 1))):
+                found = self._decoder.find(grey, track.family, track.tag_id, place, reach[i])
+                if found is not None:
+                    decoded.append((track, found))
         if decoded:
             parts.append(self._refined(grey, [t for t, _ in decoded], np.array([uv for _, uv in decoded])))
         seen = joined(parts)
@@ -271,7 +276,7 @@ class Follower:
                     wanted.append(Track(-1, board.family, tag_id, uv, k))
         if not wanted:
             return
-        reach = [1.5 * float(sides_px(track.uv)) / cells_across(track.family) for track in wanted]
+        reach = [1.5 * track.side_px / cells_across(track.family) for track in wanted]
         uv, score = self._locate(grey, wanted, [[track.uv] for track in wanted], reach)
         likely = np.flatnonzero(score >= SURE)
         seen = self._refined(grey, [wanted[i] for i in likely], uv[likely])
@@ -310,8 +315,7 @@ def _guesses(track: Track, span: _Span, k: int) -> list[np.ndarray]:
 
 def _reach_px(track: Track, span: _Span, k: int) -> float:
     """How far from its guesses a track is looked for: by how fast things move; little once it is lost."""
-    side = float(sides_px(track.uv))
-    cell = side / cells_across(track.family)
+    cell = track.side_px / cells_across(track.family)
     still = 1.5 * cell + 3.0
     if track.lost >= DECODER_TRIES:
         return still
@@ -326,7 +330,7 @@ def _in_view(track: Track, span: _Span, k: int) -> bool:
     """Whether a track's tag can be in frame k at all, by where it was and how the picture moved since."""
     height, width = span.greys[k].shape
     for place in _guesses(track, span, k):
-        u, v = place.mean(axis=0)
+        u, v = place.sum(axis=0) / 4
         if 0 <= u < width and 0 <= v < height:
             return True
     return False

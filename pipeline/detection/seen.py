@@ -84,9 +84,12 @@ class Seen:
         return replace(self, track=np.asarray(track, int))
 
 
+_BEFORE = [3, 0, 1, 2]
+
+
 def sides_px(uv: np.ndarray) -> np.ndarray:
     """Mean side of quads, (..., 4, 2) -> (...)."""
-    edge = uv - np.roll(uv, 1, axis=-2)
+    edge = uv - uv[..., _BEFORE, :]
     return np.asarray(np.sqrt(edge[..., 0] ** 2 + edge[..., 1] ** 2).mean(axis=-1))
 
 
