@@ -23,6 +23,7 @@ from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import ACCEPTED, judge
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.refine import Refiner
+from pipeline.detection.seen import search
 
 BAR = 1.5
 RECALL = 0.9
@@ -114,12 +115,10 @@ def recall(weather: View, camera: str, angle_deg: float, side_px: float, frames:
     for k in range(frames):
         rng = np.random.default_rng([seed, len(camera), int(angle_deg), int(10 * side_px), k])
         grey, tags, lens = frame(weather, camera, angle_deg, side_px, rng)
-        found = finder.find(grey)
-        status = judge(found, known, grey.shape, settings)
-        fit = Refiner(lens).refine(grey, found.family.tolist(), found.tag_id.tolist(), found.uv)
-        believed = (status == ACCEPTED) & (fit.reason == "")
+        seen = search(grey, finder, Refiner(lens))
+        believed = judge(seen, known, grey.shape, settings) == ACCEPTED
         truth = {view.tag_id: uv for view, uv in tags}
-        for number, uv in zip(found.tag_id[believed], fit.uv[believed]):
+        for number, uv in zip(seen.tag_id[believed], seen.uv[believed]):
             if int(number) in truth and np.abs(uv - truth[int(number)]).max() < CLOSE_PX:
                 accepted += 1
             else:

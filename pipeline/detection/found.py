@@ -8,9 +8,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.detection.noise import corner_covariance
-from pipeline.detection.prints import cells_across
-
 
 class Sighting(NamedTuple):
     """One tag as a search hands it over; in our conventions already."""
@@ -33,8 +30,6 @@ class Found:
     """(n,) int."""
     uv: np.ndarray
     """(n, 4, 2) corners top-left, top-right, bottom-right, bottom-left of the print; px, top-left pixel at (0, 0)."""
-    cov: np.ndarray
-    """(n, 4, 2, 2) covariance of each corner, px²."""
     side_px: np.ndarray
     """(n,) mean side of the quad."""
     hamming: np.ndarray
@@ -55,7 +50,6 @@ def gathered(sightings: Iterable[Sighting]) -> Found:
         family=np.array([row.family for row in rows], object),
         tag_id=np.array([row.tag_id for row in rows], np.int32),
         uv=uv,
-        cov=corner_covariance(uv, np.array([cells_across(row.family) for row in rows], int)),
         side_px=np.linalg.norm(np.roll(uv, -1, axis=1) - uv, axis=-1).mean(axis=1),
         hamming=np.array([row.hamming for row in rows], np.int32),
         margin=np.array([row.margin for row in rows], float),

@@ -4,44 +4,67 @@ import numpy as np
 
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import judge
-from pipeline.detection.found import Found
+from pipeline.detection.refine import REASONS
+from pipeline.detection.seen import NO_TRACK, SEARCHED, Seen
 
 SQUARE = np.array([[0, 0], [30, 0], [30, 30], [0, 30.0]])
 SETTINGS = DetectionSettings()
 
 
-def found(*tags):
-    """Tags as (id, left, top) with optional hamming, margin, scale."""
-    rows = [{"hamming": 0, "margin": 60.0, "scale": 1.0, **(tag[3] if len(tag) > 3 else {})} for tag in tags]
-    uv = np.array([SQUARE * row["scale"] + tag[1:3] for tag, row in zip(tags, rows)])
-    return Found(
-        family=np.full(len(tags), "tag36h11", object),
+def seen(*tags):
+    """Tags as (id, left, top) with optional hamming, margin, reason."""
+    rows = [{"hamming": 0, "margin": 60.0, "reason": "", **(tag[3] if len(tag) > 3 else {})} for tag in tags]
+    n = len(tags)
+    return Seen(
+        family=np.full(n, "tag36h11", object),
         tag_id=np.array([tag[0] for tag in tags]),
-        uv=uv,
-        cov=np.tile(np.eye(2), (len(tags), 4, 1, 1)),
-        side_px=np.full(len(tags), 30.0),
+        uv=np.array([SQUARE + tag[1:3] for tag in tags]),
+        cov=np.tile(np.eye(8), (n, 1, 1)),
         hamming=np.array([row["hamming"] for row in rows]),
         margin=np.array([row["margin"] for row in rows]),
+        **dict.fromkeys(("blur_px", "motion_px", "noise", "contrast", "whole", "misfit"), np.ones(n)),
+        reason=np.array([row["reason"] for row in rows], object),
+        how=np.full(n, SEARCHED, object),
+        track=np.full(n, NO_TRACK),
     )
 
 
 def statuses(*tags):
-    return judge(found(*tags), {"tag36h11": {1, 2, 3}}, (480, 640), SETTINGS).tolist()
+    return judge(seen(*tags), {"tag36h11": {1, 2, 3}}, (480, 640), SETTINGS).tolist()
 
 
 def test_each_reason_is_told():
     assert statuses(
         (1, 100, 100),
         (7, 200, 100),
-        (2, 1.9, 200),
+        (2, 1.9, 200, {"reason": "cut by the border"}),
         (3, 300, 300, {"margin": 19.0}),
-    ) == ["accepted", "unknown id", "border", "low margin"]
+    ) == ["accepted", "unknown id", "cut by the border", "low margin"]
     assert statuses((1, 100, 100, {"hamming": 2})) == ["bit errors"]
-    assert statuses((1, 100, 100, {"scale": 0.2})) == ["too small"]
+    for reason in REASONS[1:]:
+        assert statuses((1, 100, 100, {"reason": reason})) == [reason]
 
 
-def test_the_border_is_felt_on_all_four_sides():
-    assert statuses((1, 608, 100), (2, 607, 100), (3, 100, 448)) == ["border", "accepted", "border"]
+def test_of_several_reasons_the_gravest_is_told():
+    """What is wrong with the decoding comes before what is wrong with the corners, and what nobody described first."""
+    poor = {"reason": "covered", "margin": 5.0}
+    assert statuses((1, 100, 100, poor)) == ["low margin"]
+    assert statuses((1, 100, 100, {**poor, "hamming": 2})) == ["bit errors"]
+    assert statuses((7, 100, 100, {**poor, "hamming": 2})) == ["unknown id"]
+
+
+def test_what_the_print_does_not_fit_is_no_second_print():
+    assert statuses((1, 100, 100), (1, 300, 100, {"reason": "does not fit"})) == ["accepted", "does not fit"]
+    assert statuses((1, 100, 100), (1, 300, 100, {"reason": "covered"})) == ["twice in one frame"] * 2
+
+
+def test_a_tag_that_was_followed_has_no_margin_and_is_judged_by_its_fit():
+    assert statuses((1, 100, 100, {"margin": np.nan})) == ["accepted"]
+
+
+def test_nothing_seen_is_nothing_to_judge():
+    none = seen((1, 100, 100)).of(np.zeros(1, bool))
+    assert judge(none, {"tag36h11": {1}}, (480, 640), SETTINGS).tolist() == []
 
 
 def test_two_of_one_id_are_both_refused():
@@ -77,7 +100,7 @@ def test_what_may_be_a_second_print_loses_both():
 
 def test_short_codes_are_believed_only_without_a_wrong_bit():
     """184 tags of DICT_4X4_50 with one corrected bit stood in 504 frames of texture, none of tag36h11."""
-    tags = found((1, 100, 100, {"hamming": 1}), (2, 200, 100))
+    tags = seen((1, 100, 100, {"hamming": 1}), (2, 200, 100))
     for family, status in (
         ("tag36h11", "accepted"),
         ("tag16h5", "bit errors"),
@@ -88,4 +111,4 @@ def test_short_codes_are_believed_only_without_a_wrong_bit():
 
 
 def test_an_id_of_another_family_is_unknown():
-    assert judge(found((1, 100, 100)), {"tag25h9": {1}}, (480, 640), SETTINGS).tolist() == ["unknown id"]
+    assert judge(seen((1, 100, 100)), {"tag25h9": {1}}, (480, 640), SETTINGS).tolist() == ["unknown id"]

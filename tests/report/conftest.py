@@ -214,7 +214,7 @@ def log_tables(rng, seconds=120, rate=5):
         t = np.concatenate([times[seen]] * len(tags))
         status = np.array(["accepted"] * len(t), object)
         status[rng.random(len(t)) < 0.06] = "low margin"
-        status[rng.random(len(t)) < 0.02] = "border"
+        status[rng.random(len(t)) < 0.02] = "cut by the border"
         detections[camera] = {
             "time_ns": t,
             "tag_id": np.repeat(np.array(tags, np.int32), int(seen.sum())),

@@ -2,20 +2,28 @@
 
 import copy
 import dataclasses
+import re
+import tomllib
+from pathlib import Path
 
 import pytest
 
 from pipeline.config import load_machine
 from pipeline.detection import acceptance
+from pipeline.detection.refine import REASONS
 from pipeline.report import detector, render
 from pipeline.report.words import Words
+from pipeline.resources import template_folder
 from tests.report.conftest import DETECTION, MACHINE, made_up_inputs, tag_scatter
 from tests.report.pages import PageReader, as_float
 
-REFINER_REASONS = (
-    "no contrast", "does not fit", "covered", "too small", "cut by the border", "over-exposed", "under-exposed",
-    "blurred",
-)  # fmt: skip
+STATUSES = (
+    {value for name, value in vars(acceptance).items() if name.isupper() and isinstance(value, str)}
+    | set(REASONS)
+) - {"", acceptance.ACCEPTED}
+
+
+DOCS = Path(__file__).parents[2] / "docs"
 
 
 def with_detection(change=None, **files):
@@ -35,7 +43,7 @@ def test_every_rejected_tag_stands_in_the_table_under_its_reason_and_camera():
     inputs = made_up_inputs()
     rows = PageReader(render(inputs).html).tables["detector.rejected"]
     assert rows[0][:3] == ["Reason", "bench", "stickcam"]
-    assert {row[0] for row in rows[1:]} == {"low margin", "border"}
+    assert {row[0] for row in rows[1:]} == {"low margin", "cut by the border"}
     for row in rows[1:]:
         for camera, shown in zip(("bench", "stickcam"), row[1:3]):
             assert as_float(shown) == (inputs.detections[camera]["status"] == row[0]).sum()
@@ -44,12 +52,15 @@ def test_every_rejected_tag_stands_in_the_table_under_its_reason_and_camera():
     assert totals == sorted(totals, reverse=True)
 
 
-def test_every_reason_that_a_tag_can_have_is_explained():
-    words = Words()
-    named = {value for name, value in vars(acceptance).items() if name.isupper() and isinstance(value, str)}
-    assert {"low margin", "border"} < named
-    for reason in (named | set(REFINER_REASONS)) - {acceptance.ACCEPTED}:
-        assert words.has(f"reasons.{reason}"), reason
+def test_every_reason_that_a_tag_can_have_is_explained_and_no_other():
+    assert {"low margin", "cut by the border"} < STATUSES
+    words = tomllib.loads((template_folder() / "words.en.toml").read_text(encoding="utf-8"))
+    assert set(words["reasons"]) == STATUSES
+    for page in ("detector.md", "log-format.md"):
+        text = (DOCS / page).read_text(encoding="utf-8")
+        (table,) = re.findall(r"\| (?:reason|status) \|.*\n\|[-|]+\|\n((?:\|.*\n)+)", text)
+        told = {name for row in table.splitlines() for name in row.split("|")[1].strip().split(", ")}
+        assert told - {acceptance.ACCEPTED} == STATUSES, page
 
 
 def test_a_reason_nobody_foresaw_is_counted_all_the_same():
