@@ -80,10 +80,10 @@ class ArucoDetector(pyapriltags.Detector):
 def _detector(family: str, settings: DetectionSettings) -> pyapriltags.Detector:
     decimate = settings.quad_decimate
     # The library can fit the sides of each quad to the picture before it decodes. The photometric fit does that better
-    # from corners that are 0.1 px off (0.16 px in tags of 20 px), and on photographs a side was pulled 3 px away to
-    # a neighbouring edge, and a tag of 13 px lost. Where the picture was decimated the sides are that much coarser:
-    # searched with a quarter of the resolution and without their fit, the sample log's tags had 44 codes with two wrong
-    # bits instead of 1, and 45 of 4613 were lost.
+    # from corners that are 0.1 px off (0.16 px in tags of 20 px), and of 47 tags on photographs one of 13 px was not
+    # read with fitted sides. Where the picture was decimated the sides are that much coarser: glances at a quarter of
+    # the resolution without the fit gave 44 codes of two wrong bits in the sample log instead of 1, and 45 of 4613 rows
+    # were lost.
     refine_edges = decimate > 1
     detector: pyapriltags.Detector
     if is_aruco(family):
