@@ -12,10 +12,11 @@ import math
 import numba
 import numpy as np
 
+from pipeline.detection.gauss_newton import change, furthest, moved, solve
 from pipeline.detection.image_model import (
+    AT_END,
     BLUR,
     GAIN,
-    GROUND,
     OFFSET,
     PARAMETERS,
     PIXEL_VARIANCE,
@@ -33,6 +34,7 @@ from pipeline.detection.integrity import (
     point,
     unevenness,
 )
+from pipeline.detection.parts import COARSE_STEP_PX, best_part
 from pipeline.detection.straightening import bent_back, ideal_of
 
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
@@ -40,24 +42,31 @@ STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSE
 MAX_CELLS = 16
 COARSE_PIXELS = 450
 """Pixels on edges for the first steps; 700 took as many steps."""
-FINE_PIXELS = 12_000
-COARSE_STEP_PX = 0.15
-FINE_STEP_PX = 0.05
-"""A step this short ends a stage: what it leaves undone is its square over the blur, 0.002 px."""
-LEAST_VARIANCE = 0.06
-"""px²; cameras that sharpen show edges steeper than a pixel's own 1/12."""
+FINE_STEP_PX = 0.1
+"""A step this short ends a stage: edges are as steep on either side, so what it leaves undone is of the third order."""
 MISFIT_MOST = 0.2
 """What neighbouring residuals share, as a part of the print's pattern, at the most. Right prints gave up to 0.22
 (1.5 px of blur, 20 px, 45 degrees), mostly below 0.15; wrong ids from 0.19, mostly above 0.35."""
-MISFIT_MOST_SHARP = 0.45
-"""Where cells are wider than 3.5 sigmas of blur: a wrong id is seen cell by cell there, dirty prints misfit more."""
+SHARP = 1.0 / 3.5
+"""Blur in cells below which each cell is seen by itself: others could take the brightness of another id."""
+MISFIT_MOST_SHARP = 0.3
+"""Where cells are wider than 3.5 sigmas of blur: a wrong id is seen cell by cell there."""
 COVERED_MOST = 0.5
 """Part of the cells that may be masked."""
 UNEVEN = 4.0
 """`unevenness` from which each cell gets a brightness of its own; noise and JPEG gave up to 2.8, shadows 20 to 40."""
-UNEVEN_VARIANCE = 4.0
+UNEVEN_VARIANCE = 5.5
 """What free brightness of the cells adds to the variance of corners, measured on shadows that pass over tags."""
-UNEVEN_STEPS = 6
+PARTLY, PARTLY_VARIANCE = 0.03, 3.5
+"""Part of the cells that are masked from which something lies over the print, and what it adds to the variance of
+corners by what of it is too little to be masked."""
+CLIPPED, CLIPPED_VARIANCE = 0.05, 4.5
+"""Part of the pixels that are whiter than the camera could record, and what the half of each edge that is lost with
+them, and JPEG's ringing beside it, add to the variance of corners."""
+SUSPICIOUS = 0.12
+"""Misfit from which parts of the print are tried alone."""
+HOPELESS = 0.4
+"""Misfit beyond which no part fits either: nothing is there, or next to nothing of it."""
 CONTRADICTED_MOST = 0.1
 """Part of the cells, and of those that carry the id, whose middle may be of the wrong brightness."""
 JPEG_SHARE = 1.08
@@ -69,7 +78,7 @@ REASON, BLUR_PX, MOTION_PX, NOISE, CONTRAST, WHOLE, MISFIT_AT, RESPONSE_AT, CORR
 
 
 @numba.njit(cache=True, error_model="numpy")
-def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
+def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, out):
     """Lay one print over the picture.
 
     Parameters
@@ -88,6 +97,8 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
         Corners to start from, px.
     prior : (5,) float64 array
         Blur px, sigma of its variance px², sigma of its streak px², response, sigma of the response.
+    most : int
+        About how many pixels on edges are used at the most.
     out_uv : (4, 2) float64 array
         Filled: corners, px.
     out_cov : (8, 8) float64 array
@@ -121,6 +132,9 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
     par[RESPONSE] = prior[3]
     black, white = _first_light(grey, cells, n, lens, bent, H)
     par[OFFSET], par[GAIN] = black, white - black
+    if math.isnan(black):
+        out[REASON] = CUT
+        return
     if par[GAIN] < 4.0:
         out[REASON] = NO_CONTRAST
         if 0.5 * (black + white) < 25.0:
@@ -130,79 +144,64 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
         return
 
     pixels = area * (n / border) ** 2
-    room = int(min(1.5 * FINE_PIXELS, 1.5 * pixels + 100)) + 100
+    room = int(min(4.0 * most, 1.5 * pixels + 100)) + 100
     J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
     masked = np.zeros((MAX_CELLS, MAX_CELLS), np.bool_)
-    any_masked = False
     # Pixels on edges: about three beside each side of each cell.
     on_edges = min(pixels, 5.0 * n * n * cell_px * prior[0])
     coarse = max(1, int(on_edges / COARSE_PIXELS))
-    fine = max(1, math.ceil(on_edges / FINE_PIXELS))
+    fine = max(1, math.ceil(on_edges / most))
     flat = max(1, int(cell_px * cell_px / 5.0))
 
-    reason = STANDS
-    sigma, share, m, steps, first = 10.0, 1.0, 0, 0, True
-    A = np.zeros((PARAMETERS, PARAMETERS))
-    levels, uneven = cells, False
-    while True:
-        stride = coarse if first else fine
-        m = linearise(
-            grey, levels, n, masked, any_masked, lens, bent, np.linalg.inv(H), norm, par, window,
-            stride, max(flat, stride), quiet, J, r, who,
-        )  # fmt: skip
-        sigma, edge = noise_on_edges(r, who, m)
-        if m < 40 or edge < 30:
-            reason = CUT if at_border else COVERED
+    reason, share = STANDS, 1.0
+    room_for = (J, r, who)
+    place = (lens, bent, norm, window, quiet, lo, hi, cell_px)
+    strides = (coarse, fine, flat)
+    levels, uneven, parted = cells, False, False
+    H, m, A, share = _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, True, False)
+    while m > 0:
+        unlike = unevenness(r, who, m, n, par, masked)
+        if unlike < UNEVEN and _misfit(J, r, who, m, par) < SUSPICIOUS:
             break
-        Jm = J[:m]
-        A = Jm.T @ Jm
-        if uneven:
-            # The cells' own brightness and the light over all of them say the same: the light stays.
-            for k in range(PLACE):
-                A[k, k] += 1e9 * (1.0 + A[k, k])
-        x = _solve(A, Jm.T @ r[:m], par, prior, sigma)
-        step_px = _furthest(H, lo, hi, norm, x)
-        # A step that moves a corner further than a third of a cell left the valley: shorten it.
-        part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
-        step_px *= part
-        x *= part
-        H = _moved(H, norm, x)
-        _change(par, x, cell_px)
-        for k in range(m):
-            for i in range(PARAMETERS):
-                r[k] -= J[k, i] * x[i]
-        steps += 1
-        changed = False
-        if not first or (steps >= 2 and step_px < 0.5):
-            changed, share = mask(r, who, m, n, par, masked, 2.0 if uneven else 3.0)
-            any_masked = any_masked or changed
-        if uneven:
-            level(r, who, m, n, par, masked, levels)
-        if first and ((step_px < COARSE_STEP_PX and not changed) or steps >= 12):
-            first, steps = False, 0
-        elif not first and steps >= UNEVEN_STEPS and uneven:
+        misfit = _misfit(J, r, who, m, par)
+        if not parted and misfit < HOPELESS:
+            # Something lies over the print, and the whole of it gave way: does a part of it fit by itself?
+            parted = True
+            trial_H, trial_par = H.copy(), par.copy()
+            if best_part(grey, cells, n, masked, trial_H, trial_par, prior, place, strides, room_for):
+                H, par = trial_H, trial_par
+                H, m, A, share = _settle(
+                    grey, levels, n, masked, H, par, prior, place, strides, room_for, False, False
+                )
+            continue
+        if unlike < UNEVEN or misfit > HOPELESS or uneven or math.sqrt(par[BLUR]) > SHARP * cell_px:
             break
-        elif not first and not uneven and ((step_px < FINE_STEP_PX and not changed) or steps >= 6):
-            # A shadow's edge across the print is no noise: each cell gets a brightness of its own.
-            if unevenness(r, who, m, n, masked) < UNEVEN:
-                break
-            uneven, steps, levels, any_masked = True, 0, cells.copy(), False
-            masked[:] = False
+        # A shadow's edge across the print is no noise: each cell gets a brightness of its own.
+        uneven, levels = True, cells.copy()
+        masked[:] = False
+        H, m, A, share = _settle(
+            grey, levels, n, masked, H, par, prior, place, strides, room_for, False, True
+        )
+    if m == 0:
+        reason = CUT if at_border else COVERED
 
     sigma, _ = noise_on_edges(r, who, m)
     correlation = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
-    misfit = math.sqrt(correlation) * sigma / max(pattern(J, m, par), 1.0)
+    misfit = _misfit(J, r, who, m, par)
     out[BLUR_PX] = math.sqrt(max(par[BLUR] - PIXEL_VARIANCE, 0.0))
     out[MOTION_PX] = math.sqrt(24.0 * math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2))
     out[NOISE], out[CONTRAST], out[WHOLE], out[MISFIT_AT] = sigma, par[GAIN], share, misfit
     out[RESPONSE_AT], out[CORRELATION] = par[RESPONSE], correlation
     blur_cells = math.sqrt(par[BLUR]) / cell_px
+    clipped = 0
+    for k in range(m):
+        clipped += who[k, 1] == AT_END
     if reason == STANDS:
         if par[GAIN] < 3.0 * sigma:
             reason = NO_CONTRAST
         elif sigma > 0.3 * par[GAIN]:
             reason = MISFIT
-        elif misfit > (MISFIT_MOST_SHARP if blur_cells < 1.0 / 3.5 else MISFIT_MOST):
+        elif misfit > (MISFIT_MOST_SHARP if blur_cells < SHARP else MISFIT_MOST):
             reason = BLURRED if blur_cells > 0.7 else MISFIT
         else:
             every, within = contradicted(grey, cells, levels, n, lens, bent, H, norm, par)
@@ -212,12 +211,68 @@ def align(grey, cells, n, border, lens, bent, uv, prior, out_uv, out_cov, out):
                 reason = COVERED
     if uneven:
         sigma *= math.sqrt(UNEVEN_VARIANCE)
+    elif share < 1.0 - PARTLY:
+        sigma *= math.sqrt(PARTLY_VARIANCE)
+    if clipped > CLIPPED * m:
+        sigma *= math.sqrt(CLIPPED_VARIANCE)
     if reason == STANDS:
         _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov)
         for k in range(4):
             if not (0.0 <= out_uv[k, 0] <= width - 1 and 0.0 <= out_uv[k, 1] <= height - 1):
                 reason = CUT
     out[REASON] = reason
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, first, uneven):
+    """Steps until they are short, on a part of the pixels `first` if asked; marks cells in `masked`, changes `par`.
+
+    Returns the homography, how many pixels were used (0 where too few were left; their residuals are those after the
+    last step), the normal matrix with its priors, and the share of cells not masked.
+    """
+    lens, bent, norm, window, quiet, lo, hi, cell_px = place
+    coarse, fine, flat = strides
+    J, r, who = room_for
+    A = np.zeros((PARAMETERS, PARAMETERS))
+    share, steps = 1.0, 0
+    while True:
+        stride = coarse if first else fine
+        m = linearise(
+            grey, levels, n, masked, masked.any(), lens, bent, np.linalg.inv(H), norm, par, window,
+            stride, max(flat, stride), quiet, J, r, who,
+        )  # fmt: skip
+        sigma, edge = noise_on_edges(r, who, m)
+        if m < 40 or edge < 30:
+            return H, 0, A, share
+        Jm = J[:m]
+        A = Jm.T @ Jm
+        if uneven:
+            # The cells' own brightness and the light over all of them say the same: the light stays.
+            for k in range(PLACE):
+                A[k, k] += 1e9 * (1.0 + A[k, k])
+        x = solve(A, Jm.T @ r[:m], par, prior, sigma)
+        step_px = furthest(H, lo, hi, norm, x)
+        # A step that moves a corner further than a third of a cell left the valley: shorten it.
+        part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
+        step_px *= part
+        x *= part
+        H = moved(H, norm, x)
+        change(par, x, cell_px)
+        for k in range(m):
+            for i in range(PARAMETERS):
+                r[k] -= J[k, i] * x[i]
+        steps += 1
+        changed = False
+        if not first or (steps >= 2 and step_px < 0.5):
+            changed, share = mask(r, who, m, n, par, masked, 2.0 if uneven else 3.0)
+        if uneven:
+            level(r, who, m, n, par, masked, levels)
+        if first and ((step_px < COARSE_STEP_PX and not changed) or steps >= 12):
+            first, steps = False, 0
+        elif (not first and steps >= 6) or (
+            not first and not uneven and step_px < FINE_STEP_PX and not changed
+        ):
+            return H, m, A, share
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -292,81 +347,18 @@ def _first_light(grey, cells, n, lens, bent, H):
                 blacks[nb] = value
                 nb += 1
     if nb < 4 or nw < 4:
-        return 0.0, 0.0
+        return np.nan, np.nan
     return np.median(blacks[:nb]), np.median(whites[:nw])
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _add_prior(A, b, k, difference, sigma, noise):
-    weight = (noise / sigma) ** 2
-    A[k, k] += weight
-    b[k] += weight * difference
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _add_priors(A, b, par, prior, noise):
-    """What is known beforehand, beside observations whose standard deviation is `noise`."""
-    _add_prior(A, b, BLUR, prior[0] ** 2 + PIXEL_VARIANCE - par[BLUR], prior[1], noise)
-    for k in range(BLUR + 1, BLUR + 3):
-        _add_prior(A, b, k, -par[k], prior[2], noise)
-    _add_prior(A, b, RESPONSE, prior[3] - par[RESPONSE], prior[4], noise)
-    for k in range(GAIN + 1, PLACE):
-        _add_prior(A, b, k, -par[k], 0.3 * par[GAIN] + 1.0, noise)
-    for k in range(GROUND, PARAMETERS):
-        _add_prior(A, b, k, -par[k], par[GAIN], noise)
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _solve(A, b, par, prior, noise):
-    """Gauss-Newton step; A is left with the priors in it."""
-    _add_priors(A, b, par, prior, noise)
-    d = np.sqrt(np.diag(A)) + 1e-12
-    scaled = A / d / d.reshape(-1, 1)
-    for i in range(PARAMETERS):
-        scaled[i, i] += 1e-6
-    return np.linalg.solve(scaled, b / d) / d
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _furthest(H, lo, hi, norm, x):
-    """How far a step moves the corner that it moves most, px."""
-    most = 0.0
-    for k in range(4):
-        X, Y = point(H, lo if k == 0 or k == 3 else hi, lo if k < 2 else hi)
-        a, b = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
-        g = a * x[PLACE + 6] + b * x[PLACE + 7]
-        dx = norm[2] * (x[PLACE] * a + x[PLACE + 1] * b + x[PLACE + 2] - a * g)
-        dy = norm[2] * (x[PLACE + 3] * a + x[PLACE + 4] * b + x[PLACE + 5] - b * g)
-        most = max(most, math.sqrt(dx * dx + dy * dy))
-    return most
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _moved(H, norm, x):
-    """The homography after a step, which acts on the window's own coordinates."""
-    W = np.empty((3, 3))
-    for i in range(8):
-        W[i // 3, i % 3] = x[PLACE + i]
-    W[2, 2] = 0.0
-    W += np.eye(3)
-    into = np.array([[1 / norm[2], 0, -norm[0] / norm[2]], [0, 1 / norm[2], -norm[1] / norm[2]], [0, 0, 1.0]])
-    back = np.array([[norm[2], 0, norm[0]], [0, norm[2], norm[1]], [0, 0, 1.0]])
-    return back @ W @ into @ H
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _change(par, x, cell_px):
-    """Light, blur and response after a step, within what there can be."""
-    for i in range(PARAMETERS):
-        if i < PLACE or i >= BLUR:
-            par[i] += x[i]
-    par[BLUR] = min(max(par[BLUR], LEAST_VARIANCE), max(5.0, 0.5 * cell_px * cell_px))
-    streak = math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2)
-    most = max(0.9 * (par[BLUR] - PIXEL_VARIANCE), 0.01)
-    if streak > most:
-        par[BLUR + 1] *= most / streak
-        par[BLUR + 2] *= most / streak
-    par[RESPONSE] = min(max(par[RESPONSE], -0.9), 0.9)
+def _misfit(J, r, who, m, par):
+    """What the residuals of neighbouring pixels share, as a part of the print's pattern."""
+    if m == 0:
+        return 0.0
+    sigma, _ = noise_on_edges(r, who, m)
+    share = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
+    return math.sqrt(share) * sigma / max(pattern(J, m, par), 1.0)
 
 
 @numba.njit(cache=True, error_model="numpy")

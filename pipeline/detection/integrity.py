@@ -54,21 +54,30 @@ def pattern(J, m, par):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def mask(r, who, m, n, par, masked, times):
-    """Mark cells with residuals of `times` the usual; whether the marks changed, and the share of cells not marked."""
-    rms, number = np.zeros(n * n), np.zeros(n * n)
+def rms_of_cells(r, who, m, n, rms):
+    """Root mean square residual of each cell into `rms`, -1 where no pixel was used; how many were."""
+    number = np.zeros(n * n)
+    rms[:] = 0.0
     for k in range(m):
         if who[k, 1] != AT_END:
             rms[who[k, 0]] += r[k] * r[k]
             number[who[k, 0]] += 1.0
+    for c in range(n * n):
+        rms[c] = math.sqrt(rms[c] / number[c]) if number[c] > 0 else -1.0
+    return number
+
+
+@numba.njit(cache=True, error_model="numpy")
+def mask(r, who, m, n, par, masked, times):
+    """Mark cells with residuals of `times` the usual; whether the marks changed, and the share of cells not marked."""
+    rms = np.empty(n * n)
+    number = rms_of_cells(r, who, m, n, rms)
     usual = np.empty(n * n)
     have = 0
     for c in range(n * n):
-        if number[c] > 0:
-            rms[c] = math.sqrt(rms[c] / number[c])
-            if number[c] >= 3:
-                usual[have] = rms[c]
-                have += 1
+        if number[c] >= 3:
+            usual[have] = rms[c]
+            have += 1
     if have < 8:
         return False, 0.0
     middle = max(np.median(usual[:have]), 0.8)
@@ -78,8 +87,16 @@ def mask(r, who, m, n, par, masked, times):
             c = j * n + i
             if masked[j, i]:
                 continue
-            # Of few pixels the rms itself is uncertain.
-            limit = middle * (times + 4.0 / math.sqrt(max(number[c], 1.0))) + 0.02 * par[GAIN]
+            # Of few pixels the rms itself is uncertain; beside a covered cell a little is suspicious.
+            beside = (
+                masked[j, max(i - 1, 0)]
+                or masked[j, min(i + 1, n - 1)]
+                or masked[max(j - 1, 0), i]
+                or masked[min(j + 1, n - 1), i]
+            )
+            limit = middle * ((1.4 if beside else times) + 4.0 / math.sqrt(max(number[c], 1.0)))
+            if not beside:
+                limit += 0.02 * par[GAIN]
             if number[c] > 0 and rms[c] > limit:
                 masked[j, i] = True
                 changed = True
@@ -89,8 +106,11 @@ def mask(r, who, m, n, par, masked, times):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def unevenness(r, who, m, n, masked):
-    """Mean square of what cells are too bright or too dark, over what noise leaves; 1 where there is but noise."""
+def unevenness(r, who, m, n, par, masked):
+    """Mean square of what cells are too bright or too dark, over what noise leaves; 1 where there is but noise.
+
+    0 where it is less than 4 % of the contrast: on a large tag the least of dirt is beyond noise.
+    """
     total, square, number = np.zeros(n * n), np.zeros(n * n), np.zeros(n * n)
     for k in range(m):
         if who[k, 1] != AT_END:
@@ -98,14 +118,17 @@ def unevenness(r, who, m, n, masked):
             total[c] += r[k]
             square[c] += r[k] * r[k]
             number[c] += 1.0
-    between, within, cells = 0.0, 0.0, 0
+    between, within, means, cells = 0.0, 0.0, 0.0, 0
     for c in range(n * n):
         if number[c] >= 4 and not masked[c // n, c % n]:
             mean = total[c] / number[c]
+            means += mean * mean
             between += number[c] * mean * mean
             within += (square[c] - number[c] * mean * mean) / (number[c] - 1.0)
             cells += 1
-    return between / max(within, 0.3 * cells) if cells > 0 else 0.0
+    if cells == 0 or means < cells * (0.04 * par[GAIN]) ** 2:
+        return 0.0
+    return between / max(within, 0.3 * cells)
 
 
 @numba.njit(cache=True, error_model="numpy")

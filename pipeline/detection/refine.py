@@ -38,6 +38,8 @@ CUT = "cut by the border"
 OVER_EXPOSED = "over-exposed"
 UNDER_EXPOSED = "under-exposed"
 BLURRED = "blurred"
+ALL_PIXELS = 12_000
+"""More than tags of 250 px have on their edges."""
 REASONS = ("", NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED)
 """By the numbers of `alignment`."""
 
@@ -108,7 +110,12 @@ class Refiner:
         self._straightening: dict[tuple[int, ...], Straightening] = {}
 
     def refine(
-        self, grey: np.ndarray, family: Sequence[str], tag_id: Sequence[int], uv: np.ndarray
+        self,
+        grey: np.ndarray,
+        family: Sequence[str],
+        tag_id: Sequence[int],
+        uv: np.ndarray,
+        pixels: int = ALL_PIXELS,
     ) -> Refined:
         """Corners of tags whose ids are known and whose places nearly so.
 
@@ -120,6 +127,8 @@ class Refiner:
             What is printed.
         uv : (n, 4, 2) array
             Start, within about half a cell of the truth; px.
+        pixels : int
+            About how many pixels on edges are used for each tag at the most.
 
         Returns
         -------
@@ -132,7 +141,7 @@ class Refiner:
         for k in range(n):
             cells, across, border = _padded(str(family[k]), int(tag_id[k]))
             align(
-                grey, cells, across, border, lenses[k], self._intrinsics is not None, uv[k], self._prior,
+                grey, cells, across, border, lenses[k], self._intrinsics is not None, uv[k], self._prior, pixels,
                 corners[k], cov[k], results[k],
             )  # fmt: skip
         return Refined(

@@ -50,8 +50,6 @@ class Straightening:
         at = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), axis=-1)
         uv = (at - BEYOND) * STEP_PX
         straight = camera.to_pixels(camera.undistort(uv, intrinsics), intrinsics)
-        self.reaches = bool(np.all(np.isfinite(straight[BEYOND:-BEYOND, BEYOND:-BEYOND])))
-        """Whether every pixel of the picture has a ray."""
         self._shift = np.ascontiguousarray(np.nan_to_num(straight - uv))
 
     def windows(self, uv: np.ndarray) -> np.ndarray:

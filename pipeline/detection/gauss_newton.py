@@ -1,0 +1,87 @@
+"""One Gauss-Newton step of a print's alignment: what is known beforehand, the solution, and what it moves. Compiled."""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+
+from pipeline.detection.image_model import BLUR, GAIN, GROUND, PARAMETERS, PIXEL_VARIANCE, PLACE, RESPONSE
+from pipeline.detection.integrity import point
+
+LEAST_VARIANCE = 0.06
+"""px²; cameras that sharpen show edges steeper than a pixel's own 1/12."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_prior(A, b, k, difference, sigma, noise):
+    weight = (noise / sigma) ** 2
+    A[k, k] += weight
+    b[k] += weight * difference
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _add_priors(A, b, par, prior, noise):
+    """What is known beforehand, beside observations whose standard deviation is `noise`."""
+    _add_prior(A, b, BLUR, prior[0] ** 2 + PIXEL_VARIANCE - par[BLUR], prior[1], noise)
+    for k in range(BLUR + 1, BLUR + 3):
+        _add_prior(A, b, k, -par[k], prior[2], noise)
+    _add_prior(A, b, RESPONSE, prior[3] - par[RESPONSE], prior[4], noise)
+    for k in range(GAIN + 1, PLACE):
+        _add_prior(A, b, k, -par[k], 0.3 * par[GAIN] + 1.0, noise)
+    for k in range(GROUND, PARAMETERS):
+        _add_prior(A, b, k, -par[k], par[GAIN], noise)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def solve(A, b, par, prior, noise):
+    """Gauss-Newton step; A is left with the priors in it."""
+    _add_priors(A, b, par, prior, noise)
+    d = np.sqrt(np.diag(A)) + 1e-12
+    scaled = A / d / d.reshape(-1, 1)
+    for i in range(PARAMETERS):
+        scaled[i, i] += 1e-6
+    return np.linalg.solve(scaled, b / d) / d
+
+
+@numba.njit(cache=True, error_model="numpy")
+def furthest(H, lo, hi, norm, x):
+    """How far a step moves the corner that it moves most, px."""
+    most = 0.0
+    for k in range(4):
+        X, Y = point(H, lo if k == 0 or k == 3 else hi, lo if k < 2 else hi)
+        a, b = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
+        g = a * x[PLACE + 6] + b * x[PLACE + 7]
+        dx = norm[2] * (x[PLACE] * a + x[PLACE + 1] * b + x[PLACE + 2] - a * g)
+        dy = norm[2] * (x[PLACE + 3] * a + x[PLACE + 4] * b + x[PLACE + 5] - b * g)
+        most = max(most, math.sqrt(dx * dx + dy * dy))
+    return most
+
+
+@numba.njit(cache=True, error_model="numpy")
+def moved(H, norm, x):
+    """The homography after a step, which acts on the window's own coordinates."""
+    W = np.empty((3, 3))
+    for i in range(8):
+        W[i // 3, i % 3] = x[PLACE + i]
+    W[2, 2] = 0.0
+    W += np.eye(3)
+    into = np.array([[1 / norm[2], 0, -norm[0] / norm[2]], [0, 1 / norm[2], -norm[1] / norm[2]], [0, 0, 1.0]])
+    back = np.array([[norm[2], 0, norm[0]], [0, norm[2], norm[1]], [0, 0, 1.0]])
+    return back @ W @ into @ H
+
+
+@numba.njit(cache=True, error_model="numpy")
+def change(par, x, cell_px):
+    """Light, blur and response after a step, within what there can be."""
+    for i in range(PARAMETERS):
+        if i < PLACE or i >= BLUR:
+            par[i] += x[i]
+    par[BLUR] = min(max(par[BLUR], LEAST_VARIANCE), max(5.0, 0.5 * cell_px * cell_px))
+    streak = math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2)
+    most = max(0.9 * (par[BLUR] - PIXEL_VARIANCE), 0.01)
+    if streak > most:
+        par[BLUR + 1] *= most / streak
+        par[BLUR + 2] *= most / streak
+    par[RESPONSE] = min(max(par[RESPONSE], -0.9), 0.9)
