@@ -15,6 +15,8 @@ from pipeline.detection.image_model import GAIN, linearise
 from pipeline.detection.integrity import mask, noise_on_edges, rms_of_cells
 
 COARSE_STEP_PX = 0.15
+BETTER = 0.5
+"""Part of the whole's mean square that a part must get below: sharpened photographs misfit everywhere a little."""
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -61,12 +63,13 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for):
         for c in range(n * n):
             if rms[c] >= 0.0:
                 total += min(rms[c], cap) ** 2
-        if best < 0.0 or total < (0.8 * best if part == 1 else best):
-            if part > 0:
-                H[:] = trial_H
-                par[:] = trial_par
-                masked[:] = False
-                mask(r, who, m, n, par, masked, 3.0)
+        if part == 0:
+            best = BETTER * total
+        elif total < best:
+            H[:] = trial_H
+            par[:] = trial_par
+            masked[:] = False
+            mask(r, who, m, n, par, masked, 3.0)
             best = total
     return not np.array_equal(H, first_H)
 
