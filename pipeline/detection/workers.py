@@ -68,7 +68,9 @@ def search_slices(
                 write_piece(part, search_slice(part, search, reader, finders))
                 report(part)
         return
-    warm_up(search)
+    # An interrupt that comes while something compiles is lost in a callback of the compiler.
+    with _interrupts_held():
+        warm_up(search)
     lost_in_a_row = 0
     while waiting:
         suspects, waiting = _search_in_processes(search, waiting, workers, report)

@@ -18,7 +18,8 @@ def outcome(error, cov) -> Outcome:
 
 
 def trial(error, bound_px) -> corners.Trial:
-    return corners.Trial((0,), View(), outcome(error, np.eye(8) * bound_px**2), bound_px, bound_px, AWAY)
+    covariance = np.eye(8) * bound_px**2
+    return corners.Trial((0,), View(), outcome(error, covariance), np.zeros((4, 2)), bound_px, bound_px, AWAY)
 
 
 def test_errors_drawn_from_a_covariance_are_one_when_whitened_by_it():
