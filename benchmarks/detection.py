@@ -177,7 +177,7 @@ def recall_of(what: Search, slices: list[Slice], tags: int, shots: Sequence[Shot
     for shot in shots:
         grey = decode_grey(shot.jpeg, "jpeg")
         seen = search(grey, finder, refiner)
-        rows = judge(seen, what.known, grey.shape, what.settings) == ACCEPTED
+        rows = judge(seen, what.known, what.settings) == ACCEPTED
         full.append(dict(zip(seen.tag_id[rows].tolist(), seen.uv[rows])))
         full_errors += [
             uv - at for number, uv in full[-1].items() if (at := _truth(shot, number)) is not None
@@ -231,7 +231,7 @@ def false_markers(frames: int, seed: int = 5) -> tuple[int, int]:
         grey = np.clip(np.rint(light), 0, 255).astype(np.uint8)
         seen = search(grey, finder, refiner)
         decoded += len(seen)
-        accepted += int(np.sum(judge(seen, what, grey.shape, settings) == ACCEPTED))
+        accepted += int(np.sum(judge(seen, what, settings) == ACCEPTED))
     return accepted, decoded
 
 

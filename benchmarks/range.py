@@ -116,7 +116,7 @@ def recall(weather: View, camera: str, angle_deg: float, side_px: float, frames:
         rng = np.random.default_rng([seed, len(camera), int(angle_deg), int(10 * side_px), k])
         grey, tags, lens = frame(weather, camera, angle_deg, side_px, rng)
         seen = search(grey, finder, Refiner(lens))
-        believed = judge(seen, known, grey.shape, settings) == ACCEPTED
+        believed = judge(seen, known, settings) == ACCEPTED
         truth = {view.tag_id: uv for view, uv in tags}
         for number, uv in zip(seen.tag_id[believed], seen.uv[believed]):
             if int(number) in truth and np.abs(uv - truth[int(number)]).max() < CLOSE_PX:

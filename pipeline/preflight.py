@@ -228,7 +228,7 @@ def _frame_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Findin
             sizes.add((grey.shape[1], grey.shape[0]))
             # The lens of another size of picture is unknown.
             tags = search(grey, finder, refiner if grey.shape[::-1] == expected else Refiner())
-            status = judge(tags, every_id, grey.shape, site.detection)
+            status = judge(tags, every_id, site.detection)
             seen.looked_at[name] = seen.looked_at.get(name, 0) + 1
             for k in range(len(tags)):
                 family, tag_id = str(tags.family[k]), int(tags.tag_id[k])

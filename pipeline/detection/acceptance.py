@@ -27,7 +27,7 @@ KnownTags = Mapping[str, Set[int]]
 """Family -> ids that machine.toml and site.toml describe."""
 
 
-def judge(seen: Seen, known: KnownTags, shape: tuple[int, int], settings: DetectionSettings) -> np.ndarray:
+def judge(seen: Seen, known: KnownTags, settings: DetectionSettings) -> np.ndarray:
     """The status of each tag: ``accepted``, or the reason why not.
 
     Parameters
@@ -36,8 +36,6 @@ def judge(seen: Seen, known: KnownTags, shape: tuple[int, int], settings: Detect
         n tags of one picture, as the refinement left them.
     known : mapping
         Family -> ids that are described.
-    shape : (int, int)
-        Height and width of the picture.
     settings : DetectionSettings
         Margin and bit errors that are let pass.
 

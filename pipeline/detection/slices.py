@@ -112,9 +112,9 @@ def search_slice(part: Slice, search: Search, reader: LogReader, finders: Finder
         if not pictures:
             continue
         seen, key = _follow(follower, pictures, key)
-        for (number, time_ns, grey), tags in zip(pictures, seen):
+        for (number, time_ns, _), tags in zip(pictures, seen):
             if number != next_key:
-                status = judge(tags, search.known, grey.shape, search.settings)
+                status = judge(tags, search.known, search.settings)
                 rows.append(columns_of(tags, status, number, time_ns))
     if missing := len(part.frame) - sum(outcomes.values()):
         outcomes[MISSING] = missing

@@ -30,7 +30,7 @@ def seen(*tags):
 
 
 def statuses(*tags):
-    return judge(seen(*tags), {"tag36h11": {1, 2, 3}}, (480, 640), SETTINGS).tolist()
+    return judge(seen(*tags), {"tag36h11": {1, 2, 3}}, SETTINGS).tolist()
 
 
 def test_each_reason_is_told():
@@ -64,7 +64,7 @@ def test_a_tag_that_was_followed_has_no_margin_and_is_judged_by_its_fit():
 
 def test_nothing_seen_is_nothing_to_judge():
     none = seen((1, 100, 100)).of(np.zeros(1, bool))
-    assert judge(none, {"tag36h11": {1}}, (480, 640), SETTINGS).tolist() == []
+    assert judge(none, {"tag36h11": {1}}, SETTINGS).tolist() == []
 
 
 def test_two_of_one_id_are_both_refused():
@@ -107,8 +107,8 @@ def test_short_codes_are_believed_only_without_a_wrong_bit():
         ("DICT_4X4_50", "bit errors"),
     ):
         named = replace(tags, family=np.full(2, family, object))
-        assert judge(named, {family: {1, 2}}, (480, 640), SETTINGS).tolist() == [status, "accepted"]
+        assert judge(named, {family: {1, 2}}, SETTINGS).tolist() == [status, "accepted"]
 
 
 def test_an_id_of_another_family_is_unknown():
-    assert judge(seen((1, 100, 100)), {"tag25h9": {1}}, (480, 640), SETTINGS).tolist() == ["unknown id"]
+    assert judge(seen((1, 100, 100)), {"tag25h9": {1}}, SETTINGS).tolist() == ["unknown id"]

@@ -64,7 +64,8 @@ def test_slices_cover_every_frame_once_and_depend_on_time_alone(shift, tmp_path)
         assert len(mine) == 3
         assert np.concatenate([part.frame for part in mine]).tolist() == list(range(80))
         assert all(np.ptp(part.time_ns) < SLICE_S * 1e9 for part in mine)
-        assert [part.ahead and part.ahead[0] for part in mine] == [38, 75, None]  # the first frames after 30 and 60 s
+        # The first frames after 30 and 60 s.
+        assert [part.ahead and part.ahead[0] for part in mine] == [38, 75, None]
         assert [len(span) for part in mine for span in part.spans()] == [14, 13, 14, 13, 14, 13, 5]
 
 

@@ -182,7 +182,7 @@ def test_a_dense_fit_of_other_making_agrees_with_ours_more_than_with_the_files(r
 def test_many_tags_of_one_id_are_all_refused(real_data, name):
     settings = DetectionSettings()
     *_, seen = tags_of(real_data, name)
-    status = judge(seen, {"tag36h11": {0}}, (1, 1), settings)
+    status = judge(seen, {"tag36h11": {0}}, settings)
     assert "accepted" not in status.tolist()
 
 
