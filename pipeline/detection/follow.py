@@ -172,6 +172,8 @@ class Follower:
                 for i in np.flatnonzero(part.track != NO_TRACK).tolist():
                     number = int(part.track[i])
                     if number not in before and number not in waiting:
+                        # A track may stand twice in a frame: found by a search, and beside it by its board.
+                        waiting.add(number)
                         tracks.append(_track_from(span, k, part, i))
             if not tracks:
                 continue

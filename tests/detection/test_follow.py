@@ -9,7 +9,7 @@ from benchmarks._moving_tags import sequence
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
-from pipeline.detection.follow import Follower
+from pipeline.detection.follow import Follower, _Span
 from pipeline.detection.motion import Thumbnails
 from pipeline.detection.refine import Refiner
 from pipeline.detection.seen import FOLLOWED, SEARCHED
@@ -92,6 +92,21 @@ def test_what_only_the_last_search_sees_is_followed_back(shots):
     assert good_ids(seen[0]) == good_ids(last)
     assert set(seen[0].how) == {FOLLOWED}
     assert set(seen[-1].how) == {SEARCHED}
+
+
+def test_a_track_that_stands_twice_in_a_frame_is_followed_back_once(shots):
+    """As when a search and the rest of a board put one tag on one track; a drawn log died of it."""
+    greys, time_s, _ = pictures(shots, 0, 3)
+    one = follower()
+    last = one.search(greys[-1])
+    span = _Span(greys, time_s, Thumbnails(*SIZE).drift(greys))
+    on_track = last.on_tracks(np.arange(len(last)))
+    span.seen[-1] += [on_track, on_track]
+    span.tracks = len(last)
+    one._backward(span)
+    for parts in span.seen[:-1]:
+        numbers = [int(number) for part in parts for number in part.track]
+        assert len(numbers) == len(set(numbers)) > 0
 
 
 def test_a_tag_that_is_covered_for_a_while_is_found_again_on_both_sides(shots):
