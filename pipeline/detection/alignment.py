@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.gauss_newton import change, furthest, moved, solve
+from pipeline.detection.gauss_newton import change, furthest, moved, normal_equations, solve
 from pipeline.detection.image_model import (
     AT_END,
     BLUR,
@@ -244,13 +244,12 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
         sigma, edge = noise_on_edges(r, who, m)
         if m < 40 or edge < 30:
             return H, 0, A, share
-        Jm = J[:m]
-        A = Jm.T @ Jm
+        A, b = normal_equations(J, r, m)
         if uneven:
             # The cells' own brightness and the light over all of them say the same: the light stays.
             for k in range(PLACE):
                 A[k, k] += 1e9 * (1.0 + A[k, k])
-        x = solve(A, Jm.T @ r[:m], par, prior, sigma)
+        x = solve(A, b, par, prior, sigma)
         step_px = furthest(H, lo, hi, norm, x)
         # A step that moves a corner further than a third of a cell left the valley: shorten it.
         part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.detection.image_model import BLUR, GAIN, GROUND, PARAMETERS, PIXEL_VARIANCE, PLACE, RESPONSE
 from pipeline.detection.integrity import point
 
+ROWS = 384
 LEAST_VARIANCE = 0.06
 """px²; cameras that sharpen show edges steeper than a pixel's own 1/12."""
 
@@ -32,6 +33,21 @@ def _add_priors(A, b, par, prior, noise):
         _add_prior(A, b, k, -par[k], 0.3 * par[GAIN] + 1.0, noise)
     for k in range(GROUND, PARAMETERS):
         _add_prior(A, b, k, -par[k], par[GAIN], noise)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def normal_equations(J, r, m):
+    """J'J and J'r of the first m rows, a few at a time.
+
+    Larger products are shared out among threads by the library of linear algebra, and summed in another order: one
+    process would then find other last digits than two.
+    """
+    A, b = np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS)
+    for first in range(0, m, ROWS):
+        some = J[first : min(first + ROWS, m)]
+        A += some.T @ some
+        b += some.T @ r[first : min(first + ROWS, m)]
+    return A, b
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from pipeline.detection.gauss_newton import change, furthest, moved, solve
+from pipeline.detection.gauss_newton import change, furthest, moved, normal_equations, solve
 from pipeline.detection.image_model import GAIN, linearise
 from pipeline.detection.integrity import mask, noise_on_edges, rms_of_cells
 
@@ -46,8 +46,8 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for):
                 sigma, edge = noise_on_edges(r, who, m)
                 if m < 40 or edge < 30:
                     break
-                Jm = J[:m]
-                x = solve(Jm.T @ Jm, Jm.T @ r[:m], trial_par, prior, sigma)
+                A, b = normal_equations(J, r, m)
+                x = solve(A, b, trial_par, prior, sigma)
                 step_px = furthest(trial_H, lo, hi, norm, x)
                 x *= min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
                 trial_H = moved(trial_H, norm, x)
