@@ -144,7 +144,7 @@ STAGES = (
     Stage("detect", 2, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        1,
+        2,
         "adjusting the network",
         ("ingest", "detect"),
         (),
