@@ -18,14 +18,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.detection.acceptance import KnownTags
+from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.motion import Drift, Thumbnails
 from pipeline.detection.prints import cells_across
+from pipeline.detection.refine import Refiner
 from pipeline.detection.seen import (
     NO_TRACK,
     SAME_SIDES,
-    Finds,
-    Refines,
     Seen,
     joined,
     search,
@@ -93,9 +93,9 @@ class Follower:
 
     Parameters
     ----------
-    finder, glancer : Finds
+    finder, glancer : TagFinder
         Search a picture: every pixel of it, and a sixteenth of them.
-    refiner : Refines
+    refiner : Refiner
     decoder : WindowDecoder
     thumbnails : Thumbnails
         For pictures of this camera's size.
@@ -107,9 +107,9 @@ class Follower:
 
     def __init__(
         self,
-        finder: Finds,
-        glancer: Finds,
-        refiner: Refines,
+        finder: TagFinder,
+        glancer: TagFinder,
+        refiner: Refiner,
         decoder: WindowDecoder,
         thumbnails: Thumbnails,
         known: KnownTags,

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Protocol
 
 import numpy as np
 
-from pipeline.detection.found import Found
-from pipeline.detection.refine import ALL_PIXELS, Refined
+from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.refine import ALL_PIXELS, Refined, Refiner
 
 SEARCHED = "searched"
 FOLLOWED = "followed"
@@ -20,52 +19,22 @@ SAME_SIDES = 0.4
 """Two quads of one id whose centres are nearer than this part of their side are one tag."""
 
 
-class Finds(Protocol):
-    """Every tag of a picture; see `pipeline.detection.apriltag.TagFinder`."""
-
-    def find(self, grey: np.ndarray) -> Found: ...
-
-
-class Refines(Protocol):
-    """Lays known prints over the picture; see `pipeline.detection.refine.Refiner`."""
-
-    def refine(
-        self, grey: np.ndarray, family: Sequence[str], tag_id: Sequence[int], uv: np.ndarray, pixels: int
-    ) -> Refined: ...
-
-
 @dataclass(frozen=True)
-class Seen:
-    """N tags of one frame."""
+class Seen(Refined):
+    """N tags of one frame; of one whose fit does not stand `uv` is the start of the refinement, and `cov` is 0."""
 
     family: np.ndarray
     """(n,) object array of names."""
     tag_id: np.ndarray
     """(n,) int."""
-    uv: np.ndarray
-    """(n, 4, 2) corners, refined where the fit stands, else where they were decoded; px."""
-    cov: np.ndarray
-    """(n, 8, 8) covariance of u0 v0 u1 v1 ...; 0 where the fit does not stand; px²."""
     hamming: np.ndarray
     """(n,) int, corrected bits; 0 of a tag that was followed: nothing was decoded."""
     margin: np.ndarray
     """(n,) decision margin of the decoder; NaN of a tag that was followed."""
-    blur_px: np.ndarray
-    """(n,) and so on to `misfit`: see `pipeline.detection.refine.Refined`."""
-    motion_px: np.ndarray
-    noise: np.ndarray
-    contrast: np.ndarray
-    whole: np.ndarray
-    misfit: np.ndarray
-    reason: np.ndarray
-    """(n,) object array: "" where the fit stands, else why not."""
     how: np.ndarray
     """(n,) object array: `SEARCHED` or `FOLLOWED`."""
     track: np.ndarray
     """(n,) int: which tag of the span this is; `NO_TRACK` of one that is not followed."""
-
-    def __len__(self) -> int:
-        return len(self.tag_id)
 
     @property
     def centre(self) -> np.ndarray:
@@ -97,7 +66,7 @@ def sides_px(uv: np.ndarray) -> np.ndarray:
 
 def seen_at(
     grey: np.ndarray,
-    refiner: Refines,
+    refiner: Refiner,
     family: Sequence[str] | np.ndarray,
     tag_id: Sequence[int] | np.ndarray,
     uv: np.ndarray,
@@ -111,7 +80,7 @@ def seen_at(
     ----------
     grey : (H, W) uint8 array
         The picture.
-    refiner : Refines
+    refiner : Refiner
         Of its camera.
     family, tag_id : (n,) sequences
         Which tags.
@@ -127,26 +96,19 @@ def seen_at(
     pixels = PIXELS_OF_FOLLOWED if margin is None else ALL_PIXELS
     refined = refiner.refine(grey, list(family), [int(number) for number in tag_id], uv, pixels)
     stands = np.asarray(refined.reason == "", bool)[:, None, None]
+    refined = replace(refined, uv=np.where(stands, refined.uv, uv), cov=np.where(stands, refined.cov, 0.0))
     return Seen(
+        **{field.name: getattr(refined, field.name) for field in fields(refined)},
         family=np.array([*family], object),
         tag_id=np.asarray(tag_id, int),
-        uv=np.where(stands, refined.uv, uv),
-        cov=np.where(stands, refined.cov, 0.0),
         hamming=np.zeros(n, int) if hamming is None else np.asarray(hamming, int),
         margin=np.full(n, np.nan) if margin is None else np.asarray(margin, float),
-        blur_px=refined.blur_px,
-        motion_px=refined.motion_px,
-        noise=refined.noise,
-        contrast=refined.contrast,
-        whole=refined.whole,
-        misfit=refined.misfit,
-        reason=refined.reason,
         how=np.full(n, FOLLOWED if margin is None else SEARCHED, object),
         track=np.full(n, NO_TRACK) if track is None else np.asarray(track, int),
     )
 
 
-def search(grey: np.ndarray, finder: Finds, refiner: Refines) -> Seen:
+def search(grey: np.ndarray, finder: TagFinder, refiner: Refiner) -> Seen:
     """Every tag of a picture, refined; sorted by family, id and place."""
     found = finder.find(grey)
     return joined([seen_at(grey, refiner, found.family, found.tag_id, found.uv, found.hamming, found.margin)])

@@ -22,7 +22,9 @@ def seen(*tags):
         cov=np.tile(np.eye(8), (n, 1, 1)),
         hamming=np.array([row["hamming"] for row in rows]),
         margin=np.array([row["margin"] for row in rows]),
-        **dict.fromkeys(("blur_px", "motion_px", "noise", "contrast", "whole", "misfit"), np.ones(n)),
+        **dict.fromkeys(
+            ("blur_px", "motion_px", "noise", "contrast", "whole", "misfit", "response"), np.ones(n)
+        ),
         reason=np.array([row["reason"] for row in rows], object),
         how=np.full(n, SEARCHED, object),
         track=np.full(n, NO_TRACK),
