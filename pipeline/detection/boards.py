@@ -12,6 +12,11 @@ from functools import cached_property
 
 import numpy as np
 
+from pipeline.geometry import homography
+
+NEAREST = 0.05
+"""Depth of a corner that is believed to be in front of the camera, as a part of that of the corners that are seen."""
+
 
 @dataclass(frozen=True)
 class Board:
@@ -43,37 +48,14 @@ class Board:
         mine = [number for number in self.tag_id if number in seen]
         if not mine or len(mine) == len(self.tag_id):
             return {}
-        H = homography(
+        H = homography.from_points(
             np.concatenate([self.corners[number] for number in mine]),
             np.concatenate([seen[number] for number in mine]),
         )
-        anchor = np.append(self.corners[mine[0]].mean(axis=0), 1.0) @ H[2]
         found = {}
         for number in self.tag_id:
             if number not in seen:
                 p = np.column_stack([self.corners[number], np.ones(4)]) @ H.T
-                if np.all(p[:, 2] * np.sign(anchor) > 0.05 * abs(anchor)):
+                if np.all(p[:, 2] > NEAREST):
                     found[number] = p[:, :2] / p[:, 2:]
         return found
-
-
-def homography(from_xy: np.ndarray, to_uv: np.ndarray) -> np.ndarray:
-    """(3, 3) that brings (n, 2) points to (n, 2) others, n >= 4, least squares of the algebraic error."""
-    A, a = _normalised(from_xy)
-    B, b = _normalised(to_uv)
-    M = np.zeros((2 * len(A), 9))
-    M[0::2, 0:2], M[0::2, 2] = A, 1.0
-    M[1::2, 3:5], M[1::2, 5] = A, 1.0
-    M[0::2, 6:8], M[0::2, 8] = -A * B[:, :1], -B[:, 0]
-    M[1::2, 6:8], M[1::2, 8] = -A * B[:, 1:], -B[:, 1]
-    _, V = np.linalg.eigh(M.T @ M)
-    H = np.linalg.inv(b) @ V[:, 0].reshape(3, 3) @ a
-    return np.asarray(H / np.linalg.norm(H))
-
-
-def _normalised(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points about their mean at a mean distance of about 1, and the (3, 3) that does it."""
-    mean = xy.mean(axis=0)
-    scale = 1.0 / max(float(np.abs(xy - mean).mean()), 1e-9)
-    T = np.array([[scale, 0, -scale * mean[0]], [0, scale, -scale * mean[1]], [0, 0, 1]])
-    return (xy - mean) * scale, T

@@ -1,7 +1,7 @@
-"""Rotations, poses, the camera, covariances and the bucket linkage; and the conventions of the whole house.
+"""Rotations, poses, the camera, homographies, covariances, the bucket linkage; and the conventions of the house.
 
 Pure numpy, float64, batched over leading axes; nothing here reads a file or knows what a marker is for.
-Modules: ``so3`` ``se3`` ``camera`` ``gaussian`` ``linkage``. Import the module, not the function
+Modules: ``so3`` ``se3`` ``camera`` ``homography`` ``gaussian`` ``linkage``. Import the module, not the function
 (``from pipeline.geometry import se3``), so that ``se3.exp`` and ``so3.exp`` keep their surnames.
 
 Each choice below has one test in ``tests/geometry/test_conventions.py``, or beside the room that owns

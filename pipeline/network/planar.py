@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.geometry import se3, so3
+from pipeline.geometry import homography, se3, so3
 
 
 def both_poses(p_marker, xy, weight):
@@ -35,10 +35,9 @@ def both_poses(p_marker, xy, weight):
     total = weight.sum(-1)[:, None]
     centre = np.einsum("nm,nmi->ni", weight, p_marker) / total
     q = p_marker - centre[:, None]
-    size = np.sqrt(np.einsum("nm,nmi,nmi->n", weight, q, q) / total[:, 0] / 2)[:, None]
-    H = _homography(q / size[..., None], xy, weight)
+    H = homography.from_points(q, xy, weight)
     v = H[:, :2, 2]  # image of the centre
-    J = (H[:, :2, :2] - v[:, :, None] * H[:, 2:3, :2]) / size[..., None]
+    J = H[:, :2, :2] - v[:, :, None] * H[:, 2:3, :2]
     R = _both_rotations(v, J)
     q3 = np.concatenate([q, np.zeros(q.shape[:-1] + (1,))], axis=-1)
     T = np.empty((n, 2, 4, 4))
@@ -48,31 +47,6 @@ def both_poses(p_marker, xy, weight):
     shift = np.broadcast_to(np.eye(4), (n, 4, 4)).copy()
     shift[:, :2, 3] = -centre
     return T @ shift[:, None]
-
-
-def _homography(q, xy, weight):
-    """Direct linear transform, h33 = 1, in coordinates of order one around the centres."""
-    n, m = weight.shape
-    middle = np.einsum("nm,nmi->ni", weight, xy) / weight.sum(-1)[:, None]
-    d = xy - middle[:, None]
-    spread = np.sqrt(np.einsum("nm,nmi,nmi->n", weight, d, d) / weight.sum(-1) / 2)
-    spread = np.where(spread > 0, spread, 1.0)[:, None, None]
-    d = d / spread
-    A = np.zeros((n, m, 2, 8))
-    A[:, :, 0, 0:2], A[:, :, 0, 2] = q, 1.0
-    A[:, :, 1, 3:5], A[:, :, 1, 5] = q, 1.0
-    A[..., 6:8] = -d[..., :, None] * q[..., None, :]
-    N = np.einsum("nm,nmki,nmkj->nij", weight, A, A)
-    b = np.einsum("nm,nmki,nmk->ni", weight, A, d)
-    degenerate = ~(np.linalg.cond(N) < 1e13)
-    N[degenerate] = np.eye(8)
-    b[degenerate] = np.nan
-    h = np.linalg.solve(N, b[..., None])[..., 0]
-    H = np.concatenate([h, np.ones((n, 1))], axis=-1).reshape(n, 3, 3)
-    back = np.broadcast_to(np.eye(3), (n, 3, 3)).copy()
-    back[:, 0, 0] = back[:, 1, 1] = spread[:, 0, 0]
-    back[:, :2, 2] = middle
-    return back @ H
 
 
 def _both_rotations(v, J):

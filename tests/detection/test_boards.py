@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pipeline.detection.boards import Board, homography
+from pipeline.detection.boards import Board
 from pipeline.geometry import camera
 
 SQUARE = 0.13 * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
@@ -46,12 +46,15 @@ def test_nothing_is_told_where_all_are_seen_or_none():
     assert BOARD.places({77: truth[1]}) == {}
 
 
-def test_the_homography_of_four_points_is_exact():
-    rng = np.random.default_rng(0)
-    xy = SQUARE + 5.0
-    H = np.array([[900, 40, 600], [-30, 850, 400], [0.1, -0.2, 1.0]])
-    p = np.column_stack([xy, np.ones(4)]) @ H.T
-    uv = p[:, :2] / p[:, 2:]
-    q = np.column_stack([rng.uniform(4, 6, (9, 2)), np.ones(9)])
-    here, there = q @ H.T, q @ homography(xy, uv).T
-    assert np.allclose(here[:, :2] / here[:, 2:], there[:, :2] / there[:, 2:], atol=1e-6)
+def test_a_tag_behind_the_camera_has_no_place():
+    """A wall seen aslant, 2 m away at tag 1, beside the camera at tag 4 and behind it at tag 5."""
+    c, s = np.cos(1.0), np.sin(1.0)
+    R = np.array([[c, 0, s], [0, -1, 0], [s, 0, -c]])
+    centres = {1: 0.0, 2: 1.0, 3: -1.0, 4: -2.2, 5: -5.0}
+    corners = {number: SQUARE + (x, 0.0) for number, x in centres.items()}
+    wall = Board("tag36h11", tuple(centres), tuple(tuple(map(tuple, xy)) for xy in corners.values()))
+    away = {number: np.column_stack([xy, np.zeros(4)]) @ R.T + (0, 0, 2.0) for number, xy in corners.items()}
+    uv = away[1][:, :2] / away[1][:, 2:] * 1730 + (640, 480)
+    depth = {number: round(float(p[:, 2].min()), 2) for number, p in away.items()}
+    print(f"nearest corner of each tag, metres in front of the camera: {depth}")
+    assert sorted(wall.places({1: uv})) == [2, 3]
