@@ -293,7 +293,9 @@ def main() -> int:
         "--every", type=int, default=16, help="one in so many frames for the full searches' time"
     )
     parser.add_argument("--textures", type=int, default=5000, help="frames without tags (default 5000)")
-    parser.add_argument("--minutes", type=float, default=20.0, help="of the long log (default 20)")
+    parser.add_argument(
+        "--minutes", type=float, default=20.0, help="of the long log (default 20; 0 leaves it out)"
+    )
     options = parser.parse_args()
     rows: list[Cost | Recall | Long | dict] = []
     failed: list[str] = []
@@ -336,14 +338,15 @@ def main() -> int:
         print(f"{options.textures} frames without tags: {decoded} decoded, {accepted} accepted", flush=True)
         if accepted:
             failed.append(f"{accepted} false markers")
-        long = long_log(folder, options.minutes)
-        rows.append(long)
-        print(
-            f"{long.minutes:g} min of 640x480, {long.frames} frames: {long.seconds:.0f} s, peak {long.peak_mb:.0f} MB, "
-            f"slope {long.slope_mb_per_minute:+.2f} MB per minute of log"
-        )
-        if long.slope_mb_per_minute > SLOPE_BAR:
-            failed.append(f"memory grows by {long.slope_mb_per_minute:.2f} MB per minute of log")
+        if options.minutes > 0:
+            long = long_log(folder, options.minutes)
+            rows.append(long)
+            print(
+                f"{long.minutes:g} min of 640x480, {long.frames} frames: {long.seconds:.0f} s, "
+                f"peak {long.peak_mb:.0f} MB, slope {long.slope_mb_per_minute:+.2f} MB per minute of log"
+            )
+            if long.slope_mb_per_minute > SLOPE_BAR:
+                failed.append(f"memory grows by {long.slope_mb_per_minute:.2f} MB per minute of log")
     hours = {tags: SHIFT_FRAMES * ms / 1e3 / 2 / 3600 for tags, ms in follow_ms.items()}
     shift = "; ".join(f"{tags} tags {value:.2f} h" for tags, value in hours.items())
     print(f"a shift of 8 h, 2 cameras, 10 Hz at 1280x960 on two cores: {shift}")
