@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.gauss_newton import change, furthest, moved, normal_equations, solve
+from pipeline.detection.gauss_newton import COARSE_STEP_PX, step
 from pipeline.detection.image_model import (
     AT_END,
     BLUR,
@@ -22,7 +22,6 @@ from pipeline.detection.image_model import (
     PIXEL_VARIANCE,
     PLACE,
     RESPONSE,
-    linearise,
 )
 from pipeline.detection.integrity import (
     contradicted,
@@ -34,7 +33,7 @@ from pipeline.detection.integrity import (
     point,
     unevenness,
 )
-from pipeline.detection.parts import COARSE_STEP_PX, best_part
+from pipeline.detection.parts import best_part
 from pipeline.detection.straightening import bent_back, ideal_of
 
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
@@ -57,9 +56,13 @@ UNEVEN = 4.0
 """`unevenness` from which each cell gets a brightness of its own; noise and JPEG gave up to 2.8, shadows 20 to 40."""
 UNEVEN_VARIANCE = 5.5
 """What free brightness of the cells adds to the variance of corners, measured on shadows that pass over tags."""
-PARTLY, PARTLY_VARIANCE = 0.03, 3.5
+PARTLY, PARTLY_VARIANCE = 0.03, 5.0
 """Part of the cells that are masked from which something lies over the print, and what it adds to the variance of
 corners by what of it is too little to be masked."""
+PARTLY_PX = 0.015
+"""What it adds besides, on large tags that the noise alone would leave more certain than that."""
+MISFIT_MOST_PARTLY = 0.07
+"""As `MISFIT_MOST`, where something lies over the print: half-covered prints at their true place gave below 0.06."""
 CLIPPED, CLIPPED_VARIANCE = 0.05, 4.5
 """Part of the pixels that are whiter than the camera could record, and what the half of each edge that is lost with
 them, and JPEG's ringing beside it, add to the variance of corners."""
@@ -74,7 +77,7 @@ JPEG_SHARE = 1.08
 longer correlations add, measured at JPEG qualities 70 to 95 and noise 1 to 6."""
 
 # Places in the vector of results.
-REASON, BLUR_PX, MOTION_PX, NOISE, CONTRAST, WHOLE, MISFIT_AT, RESPONSE_AT, CORRELATION, RESULTS = range(10)
+REASON, BLUR_PX, MOTION_PX, NOISE, CONTRAST, WHOLE, MISFIT_AT, RESPONSE_AT, RESULTS = range(9)
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -161,18 +164,16 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
     H, m, A, share = _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, True, False)
     while m > 0:
         unlike = unevenness(r, who, m, n, par, masked)
-        if unlike < UNEVEN and _misfit(J, r, who, m, par) < SUSPICIOUS:
-            break
         misfit = _misfit(J, r, who, m, par)
+        if unlike < UNEVEN and misfit < SUSPICIOUS and (parted or share >= 1.0 - PARTLY):
+            break
         if not parted and misfit < HOPELESS:
             # Something lies over the print, and the whole of it gave way: does a part of it fit by itself?
             parted = True
-            trial_H, trial_par = H.copy(), par.copy()
-            if best_part(grey, cells, n, masked, trial_H, trial_par, prior, place, strides, room_for):
-                H, par = trial_H, trial_par
-                H, m, A, share = _settle(
-                    grey, levels, n, masked, H, par, prior, place, strides, room_for, False, False
-                )
+            H = best_part(grey, cells, n, masked, H, par, prior, place, strides, room)
+            H, m, A, share = _settle(
+                grey, levels, n, masked, H, par, prior, place, strides, room_for, False, False
+            )
             continue
         if unlike < UNEVEN or misfit > HOPELESS or uneven or math.sqrt(par[BLUR]) > SHARP * cell_px:
             break
@@ -186,13 +187,14 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         reason = CUT if at_border else COVERED
 
     sigma, _ = noise_on_edges(r, who, m)
-    correlation = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
+    correlation = neighbours(r, who, m, sigma)
     misfit = _misfit(J, r, who, m, par)
     out[BLUR_PX] = math.sqrt(max(par[BLUR] - PIXEL_VARIANCE, 0.0))
     out[MOTION_PX] = math.sqrt(24.0 * math.sqrt(par[BLUR + 1] ** 2 + par[BLUR + 2] ** 2))
     out[NOISE], out[CONTRAST], out[WHOLE], out[MISFIT_AT] = sigma, par[GAIN], share, misfit
-    out[RESPONSE_AT], out[CORRELATION] = par[RESPONSE], correlation
+    out[RESPONSE_AT] = par[RESPONSE]
     blur_cells = math.sqrt(par[BLUR]) / cell_px
+    partly = share < 1.0 - PARTLY
     clipped = 0
     for k in range(m):
         clipped += who[k, 1] == AT_END
@@ -203,6 +205,8 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
             reason = MISFIT
         elif misfit > (MISFIT_MOST_SHARP if blur_cells < SHARP else MISFIT_MOST):
             reason = BLURRED if blur_cells > 0.7 else MISFIT
+        elif partly and misfit > MISFIT_MOST_PARTLY:
+            reason = COVERED
         else:
             every, within = contradicted(grey, cells, levels, n, lens, bent, H, norm, par)
             if within > CONTRADICTED_MOST * (n - 4) ** 2:
@@ -211,13 +215,16 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
                 reason = COVERED
     if uneven:
         sigma *= math.sqrt(UNEVEN_VARIANCE)
-    elif share < 1.0 - PARTLY:
+    elif partly:
         sigma *= math.sqrt(PARTLY_VARIANCE)
     if clipped > CLIPPED * m:
         sigma *= math.sqrt(CLIPPED_VARIANCE)
     if reason == STANDS:
         _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov)
         for k in range(4):
+            if partly:
+                out_cov[2 * k, 2 * k] += PARTLY_PX**2
+                out_cov[2 * k + 1, 2 * k + 1] += PARTLY_PX**2
             if not (0.0 <= out_uv[k, 0] <= width - 1 and 0.0 <= out_uv[k, 1] <= height - 1):
                 reason = CUT
     out[REASON] = reason
@@ -230,33 +237,16 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
     Returns the homography, how many pixels were used (0 where too few were left; their residuals are those after the
     last step), the normal matrix with its priors, and the share of cells not masked.
     """
-    lens, bent, norm, window, quiet, lo, hi, cell_px = place
     coarse, fine, flat = strides
     J, r, who = room_for
-    A = np.zeros((PARAMETERS, PARAMETERS))
     share, steps = 1.0, 0
     while True:
         stride = coarse if first else fine
-        m = linearise(
-            grey, levels, n, masked, masked.any(), lens, bent, np.linalg.inv(H), norm, par, window,
-            stride, max(flat, stride), quiet, J, r, who,
-        )  # fmt: skip
-        sigma, edge = noise_on_edges(r, who, m)
-        if m < 40 or edge < 30:
+        H, m, A, x, step_px = step(
+            grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for
+        )
+        if m == 0:
             return H, 0, A, share
-        A, b = normal_equations(J, r, m)
-        if uneven:
-            # The cells' own brightness and the light over all of them say the same: the light stays.
-            for k in range(PLACE):
-                A[k, k] += 1e9 * (1.0 + A[k, k])
-        x = solve(A, b, par, prior, sigma)
-        step_px = furthest(H, lo, hi, norm, x)
-        # A step that moves a corner further than a third of a cell left the valley: shorten it.
-        part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
-        step_px *= part
-        x *= part
-        H = moved(H, norm, x)
-        change(par, x, cell_px)
         for k in range(m):
             for i in range(PARAMETERS):
                 r[k] -= J[k, i] * x[i]
@@ -266,11 +256,10 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
             changed, share = mask(r, who, m, n, par, masked, 2.0 if uneven else 3.0)
         if uneven:
             level(r, who, m, n, par, masked, levels)
-        if first and ((step_px < COARSE_STEP_PX and not changed) or steps >= 12):
-            first, steps = False, 0
-        elif (not first and steps >= 6) or (
-            not first and not uneven and step_px < FINE_STEP_PX and not changed
-        ):
+        if first:
+            if (step_px < COARSE_STEP_PX and not changed) or steps >= 12:
+                first, steps = False, 0
+        elif steps >= 6 or (step_px < FINE_STEP_PX and not changed and not uneven):
             return H, m, A, share
 
 
@@ -356,8 +345,7 @@ def _misfit(J, r, who, m, par):
     if m == 0:
         return 0.0
     sigma, _ = noise_on_edges(r, who, m)
-    share = min(max(neighbours(r, who, m, sigma), 0.0), 0.6)
-    return math.sqrt(share) * sigma / max(pattern(J, m, par), 1.0)
+    return math.sqrt(neighbours(r, who, m, sigma)) * sigma / max(pattern(J, m, par), 1.0)
 
 
 @numba.njit(cache=True, error_model="numpy")

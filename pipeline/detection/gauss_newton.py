@@ -7,12 +7,56 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.image_model import BLUR, GAIN, GROUND, PARAMETERS, PIXEL_VARIANCE, PLACE, RESPONSE
-from pipeline.detection.integrity import point
+from pipeline.detection.image_model import (
+    BLUR,
+    GAIN,
+    GROUND,
+    PARAMETERS,
+    PIXEL_VARIANCE,
+    PLACE,
+    RESPONSE,
+    linearise,
+)
+from pipeline.detection.integrity import noise_on_edges, point
 
+COARSE_STEP_PX = 0.15
+"""A step this short ends the steps on a part of the pixels."""
 ROWS = 384
+LEAST_PIXELS, LEAST_ON_EDGES = 40, 30
+"""Fewer determine no print."""
 LEAST_VARIANCE = 0.06
 """px²; cameras that sharpen show edges steeper than a pixel's own 1/12."""
+
+
+@numba.njit(cache=True, error_model="numpy")
+def step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for):
+    """One step from `H` and `par`, which is changed, on one in `stride` pixels near edges and in `flat` of the rest.
+
+    Returns the homography after it, the pixels used (0 if they are too few; nothing is changed then), the normal
+    matrix with its priors, the step as it was taken and how far it moved a corner, px. `room_for` holds derivatives,
+    residuals and owners of the pixels before the step.
+    """
+    lens, bent, norm, window, quiet, lo, hi, cell_px = place
+    J, r, who = room_for
+    m = linearise(
+        grey, levels, n, masked, masked.any(), lens, bent, np.linalg.inv(H), norm, par, window,
+        stride, max(flat, stride), quiet, J, r, who,
+    )  # fmt: skip
+    sigma, edge = noise_on_edges(r, who, m)
+    if m < LEAST_PIXELS or edge < LEAST_ON_EDGES:
+        return H, 0, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0
+    A, b = _normal_equations(J, r, m)
+    if uneven:
+        # The cells' own brightness and the light over all of them say the same: the light stays.
+        for k in range(PLACE):
+            A[k, k] += 1e9 * (1.0 + A[k, k])
+    x = _solve(A, b, par, prior, sigma)
+    step_px = _furthest(H, lo, hi, norm, x)
+    # A step that moves a corner further than a third of a cell left the valley: shorten it.
+    part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
+    x *= part
+    _change(par, x, cell_px)
+    return _moved(H, norm, x), m, A, x, step_px * part
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -36,7 +80,7 @@ def _add_priors(A, b, par, prior, noise):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def normal_equations(J, r, m):
+def _normal_equations(J, r, m):
     """J'J and J'r of the first m rows, a few at a time.
 
     Larger products are shared out among threads by the library of linear algebra, and summed in another order: one
@@ -51,7 +95,7 @@ def normal_equations(J, r, m):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def solve(A, b, par, prior, noise):
+def _solve(A, b, par, prior, noise):
     """Gauss-Newton step; A is left with the priors in it."""
     _add_priors(A, b, par, prior, noise)
     d = np.sqrt(np.diag(A)) + 1e-12
@@ -62,7 +106,7 @@ def solve(A, b, par, prior, noise):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def furthest(H, lo, hi, norm, x):
+def _furthest(H, lo, hi, norm, x):
     """How far a step moves the corner that it moves most, px."""
     most = 0.0
     for k in range(4):
@@ -76,7 +120,7 @@ def furthest(H, lo, hi, norm, x):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def moved(H, norm, x):
+def _moved(H, norm, x):
     """The homography after a step, which acts on the window's own coordinates."""
     W = np.empty((3, 3))
     for i in range(8):
@@ -89,7 +133,7 @@ def moved(H, norm, x):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def change(par, x, cell_px):
+def _change(par, x, cell_px):
     """Light, blur and response after a step, within what there can be."""
     for i in range(PARAMETERS):
         if i < PLACE or i >= BLUR:

@@ -31,13 +31,13 @@ def noise_on_edges(r, who, m):
 
 @numba.njit(cache=True, error_model="numpy")
 def neighbours(r, who, m, sigma):
-    """Correlation of the residuals of pixels beside each other, on edges."""
+    """Correlation of the residuals of pixels beside each other, on edges; 0 to 0.6, beyond which it is no noise."""
     pairs, product = 0, 0.0
     for k in range(m - 1):
         if who[k + 1, 2] == who[k, 2] + 1 and who[k, 1] == ON_EDGE and who[k + 1, 1] == ON_EDGE:
             pairs += 1
             product += r[k] * r[k + 1]
-    return product / (pairs * sigma * sigma) if pairs > 0 else 0.0
+    return min(max(product / (pairs * sigma * sigma), 0.0), 0.6) if pairs > 0 else 0.0
 
 
 @numba.njit(cache=True, error_model="numpy")
