@@ -39,10 +39,13 @@ from pipeline.detection.straightening import bent_back, ideal_of
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
 
 MAX_CELLS = 16
-COARSE_PIXELS = 450
-"""Pixels on edges for the first steps; 700 took as many steps."""
+COARSE_PIXELS = 200
+"""Pixels on edges for the first steps."""
+QUIET = 0.02
+"""Noise over contrast for which a limit of pixels is meant; noisier tags get more of them, by its square."""
 FINE_STEP_PX = 0.1
-"""A step this short ends a stage: edges are as steep on either side, so what it leaves undone is of the third order."""
+"""A step this short ends a stage: edges are as steep on either side, so what it leaves undone is of the third order.
+Where every pixel is used and the noise leaves less than that, half of it."""
 MISFIT_MOST = 0.2
 """What neighbouring residuals share, as a part of the print's pattern, at the most. Right prints gave up to 0.22
 (1.5 px of blur, 20 px, 45 degrees), mostly below 0.15; wrong ids from 0.19, mostly above 0.35."""
@@ -101,7 +104,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
     prior : (5,) float64 array
         Blur px, sigma of its variance px², sigma of its streak px², response, sigma of the response.
     most : int
-        About how many pixels on edges are used at the most.
+        About how many pixels on edges are used at the most where the noise is `QUIET`.
     out_uv : (4, 2) float64 array
         Filled: corners, px.
     out_cov : (8, 8) float64 array
@@ -147,14 +150,14 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         return
 
     pixels = area * (n / border) ** 2
-    room = int(min(4.0 * most, 1.5 * pixels + 100)) + 100
+    room = int(min(20.0 * most, 1.5 * pixels + 100)) + 100
     J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
     masked = np.zeros((MAX_CELLS, MAX_CELLS), np.bool_)
     # Pixels on edges: about three beside each side of each cell.
     on_edges = min(pixels, 5.0 * n * n * cell_px * prior[0])
     coarse = max(1, int(on_edges / COARSE_PIXELS))
-    fine = max(1, math.ceil(on_edges / most))
-    flat = max(1, int(cell_px * cell_px / 5.0))
+    fine = on_edges / most
+    flat = max(1, int(cell_px * cell_px / 3.0))
 
     reason, share = STANDS, 1.0
     room_for = (J, r, who)
@@ -239,9 +242,12 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
     """
     coarse, fine, flat = strides
     J, r, who = room_for
-    share, steps = 1.0, 0
+    share, steps, sigma = 1.0, 0, 0.0
     while True:
-        stride = coarse if first else fine
+        stride = coarse
+        if not first:
+            more = min(max(sigma / (QUIET * max(par[GAIN], 1.0)), 1.0), 3.0) ** 2
+            stride = max(1, math.ceil(fine / more))
         H, m, A, x, step_px = step(
             grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for
         )
@@ -250,6 +256,7 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
         for k in range(m):
             for i in range(PARAMETERS):
                 r[k] -= J[k, i] * x[i]
+        sigma, _ = noise_on_edges(r, who, m)
         steps += 1
         changed = False
         if not first or (steps >= 2 and step_px < 0.5):
@@ -257,9 +264,11 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
         if uneven:
             level(r, who, m, n, par, masked, levels)
         if first:
-            if (step_px < COARSE_STEP_PX and not changed) or steps >= 12:
+            if (step_px < COARSE_STEP_PX and not changed) or steps >= 8:
                 first, steps = False, 0
-        elif steps >= 6 or (step_px < FINE_STEP_PX and not changed and not uneven):
+        elif steps >= 6 or (
+            step_px < (FINE_STEP_PX if stride > 1 else 0.5 * FINE_STEP_PX) and not changed and not uneven
+        ):
             return H, m, A, share
 
 

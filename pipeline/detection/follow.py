@@ -1,9 +1,10 @@
 """Tags followed from frame to frame between two searches, forward and backward.
 
 A search of a whole frame costs twenty times what decoding it costs, a window of one known tag a tenth. So a span of
-frames is searched whole at its first and its last frame, in between only where the picture has moved on; a glance
-with a quarter of the resolution now and then finds what comes and goes. What is found is followed. Forward first; what
-a later search found and the frames before it have not is then followed backward, until it is met or the span ends.
+frames is searched whole at its first and its last frame; in between it is swept with half the resolution where the
+picture has moved on, and a glance with a quarter of it now and then finds what comes and goes. What is found is
+followed. Forward first; what a later search found and the frames before it have not is then followed backward, until
+it is met or the span ends.
 
 A tag is looked for where its own motion, the picture's motion and its last place say, by the correlation of its cells
 (`windows.locate`); the decoder looks into the window only where that fails. What counts is the refinement's word: it
@@ -34,17 +35,20 @@ from pipeline.detection.seen import (
 )
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
-GLANCE_S = 1.5
+GLANCE_S = 2.5
 """Between two glances: searches of the frame decimated by four. They take a twelfth of a search and miss tags under
 some 40 px; what comes from behind something and goes again within a span is found by them."""
 GLANCE_SHARE = 0.15
 """Part of the picture that was not in view at the last glance, from which on the next one is due."""
-SEARCH_SHARE = 0.6
-"""The same for searches of the whole frame."""
+SWEEP_SHARE = 0.6
+"""The same for sweeps: searches of the frame decimated by two. They take half of a search's time, and miss tags under
+some 20 px."""
 UNCERTAIN_S = 1.0
-"""Between searches of the whole frame while the picture's motion cannot be told."""
+"""Between sweeps while the picture's motion cannot be told."""
 DECODER_TRIES = 2
 """Frames after a tag was lost in which the decoder looks for it; after them only its correlation tells of it."""
+LOST_EVERY = 3
+"""After them a lost tag is looked for in one in so many frames; from where it is found again it is followed back."""
 SURE = 0.6
 """Correlation of a place with which a tag that cannot be refined is still taken to be there, covered or blurred."""
 
@@ -93,8 +97,8 @@ class Follower:
 
     Parameters
     ----------
-    finder, glancer : TagFinder
-        Search a picture: every pixel of it, and a sixteenth of them.
+    finder, sweeper, glancer : TagFinder
+        Search a picture: every pixel of it, a quarter and a sixteenth of them.
     refiner : Refiner
     decoder : WindowDecoder
     thumbnails : Thumbnails
@@ -108,6 +112,7 @@ class Follower:
     def __init__(
         self,
         finder: TagFinder,
+        sweeper: TagFinder,
         glancer: TagFinder,
         refiner: Refiner,
         decoder: WindowDecoder,
@@ -115,7 +120,8 @@ class Follower:
         known: KnownTags,
         boards: Sequence[Board] = (),
     ):
-        self._finder, self._glancer, self._refiner, self._decoder = finder, glancer, refiner, decoder
+        self._finder, self._sweeper, self._glancer = finder, sweeper, glancer
+        self._refiner, self._decoder = refiner, decoder
         self._thumbnails, self._known = thumbnails, known
         self._boards = [board for board in boards if len(board.tag_id) > 1]
 
@@ -148,13 +154,13 @@ class Follower:
         tracks: list[Track] = []
         self._take(span, 0, first, tracks)
         self._complete(span, 0, tracks)
-        searched = glanced = 0
+        swept = glanced = 0
         for k in range(1, len(span)):
             if k == len(span) - 1:
                 self._take(span, k, last, tracks)
-            elif _search_is_due(span, searched, k):
-                self._take(span, k, self.search(span.greys[k]), tracks)
-                searched = glanced = k
+            elif _sweep_is_due(span, swept, k):
+                self._take(span, k, search(span.greys[k], self._sweeper, self._refiner), tracks)
+                swept = glanced = k
             elif _glance_is_due(span, glanced, k):
                 self._take(span, k, search(span.greys[k], self._glancer, self._refiner), tracks)
                 glanced = k
@@ -206,6 +212,13 @@ class Follower:
 
     def _advance(self, span: _Span, k: int, tracks: Sequence[Track]) -> Seen:
         """Look for some tracks in frame k; those found have moved on, the others are lost for a frame more."""
+        due = [track for track in tracks if track.lost < DECODER_TRIES or track.lost % LOST_EVERY == 0]
+        seen = self._look(span, k, due)
+        for track in tracks:
+            track.lost += track.frame != k
+        return seen
+
+    def _look(self, span: _Span, k: int, tracks: Sequence[Track]) -> Seen:
         grey = span.greys[k]
         if not tracks:
             return seen_at(grey, self._refiner, [], [], np.zeros((0, 4, 2)))
@@ -251,12 +264,10 @@ class Follower:
         if decoded:
             parts.append(self._refined(grey, [t for t, _ in decoded], np.array([uv for _, uv in decoded])))
         seen = joined(parts)
-        left = {track.number: track for track in tracks}
+        numbered = {track.number: track for track in tracks}
         for i, number in enumerate(seen.track.tolist()):
-            moved = left.pop(number)
+            moved = numbered[number]
             moved.at(seen.uv[i], k, span.time_s[k] - span.time_s[moved.frame])
-        for track in left.values():
-            track.lost += 1
         return seen
 
     def _complete(self, span: _Span, k: int, tracks: list[Track]) -> None:
@@ -364,10 +375,10 @@ def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:
     return track
 
 
-def _search_is_due(span: _Span, searched: int, k: int) -> bool:
-    if not np.all(span.certain[searched + 1 : k + 1]):
-        return bool(span.time_s[k] - span.time_s[searched] >= UNCERTAIN_S)
-    return _new_share(span, searched, k) > SEARCH_SHARE
+def _sweep_is_due(span: _Span, swept: int, k: int) -> bool:
+    if not np.all(span.certain[swept + 1 : k + 1]):
+        return bool(span.time_s[k] - span.time_s[swept] >= UNCERTAIN_S)
+    return _new_share(span, swept, k) > SWEEP_SHARE
 
 
 def _glance_is_due(span: _Span, glanced: int, k: int) -> bool:

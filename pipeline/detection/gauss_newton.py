@@ -19,7 +19,7 @@ from pipeline.detection.image_model import (
 )
 from pipeline.detection.integrity import noise_on_edges, point
 
-COARSE_STEP_PX = 0.15
+COARSE_STEP_PX = 0.3
 """A step this short ends the steps on a part of the pixels."""
 ROWS = 384
 LEAST_PIXELS, LEAST_ON_EDGES = 40, 30
@@ -40,7 +40,7 @@ def step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, ro
     J, r, who = room_for
     m = linearise(
         grey, levels, n, masked, masked.any(), lens, bent, np.linalg.inv(H), norm, par, window,
-        stride, max(flat, stride), quiet, J, r, who,
+        stride, stride * math.ceil(flat / stride), quiet, J, r, who,
     )  # fmt: skip
     sigma, edge = noise_on_edges(r, who, m)
     if m < LEAST_PIXELS or edge < LEAST_ON_EDGES:

@@ -122,6 +122,21 @@ def _row_of_lens(lens, y, row_x, row_y):
             k += 1
 
 
+@numba.njit(cache=True, error_model="numpy")
+def _furthest_reach(G, n, vxx, vyy, vxy):
+    """Cells beyond which no pixel of the print feels an edge, each way: the most is at one of its corners."""
+    H = np.linalg.inv(G)
+    reach_s = reach_t = 0.0
+    for k in range(4):
+        s, t = n * float(k % 2), n * float(k // 2)
+        z = H[2, 0] * s + H[2, 1] * t + H[2, 2]  # 1 over G's third row at its pixel
+        sx, sy = (G[0, 0] - s * G[2, 0]) * z, (G[0, 1] - s * G[2, 1]) * z
+        tx, ty = (G[1, 0] - t * G[2, 0]) * z, (G[1, 1] - t * G[2, 1]) * z
+        reach_s = max(reach_s, sx * sx * vxx + 2.0 * sx * sy * vxy + sy * sy * vyy)
+        reach_t = max(reach_t, tx * tx * vxx + 2.0 * tx * ty * vxy + ty * ty * vyy)
+    return 1.01 * NEAR * math.sqrt(reach_s), 1.01 * NEAR * math.sqrt(reach_t)
+
+
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
 def linearise(
     grey,
@@ -169,7 +184,8 @@ def linearise(
     window : (4,) int array
         x0, y0, x1, y1.
     stride, flat_stride : int
-        One in so many pixels near an edge, and of those that see one cell only, is used.
+        One in so many pixels near an edge is used, and of those that see one cell only; the second is a multiple of
+        the first.
     quiet : float64
         Width of the white rim that is part of the print, cells. Only as much of it is used as the border's edge needs.
     J : (m, PARAMETERS) float64 array
@@ -194,13 +210,15 @@ def linearise(
     ground = np.zeros(4)
     room = len(r)
     scale = norm[2]
+    reach_s, reach_t = _furthest_reach(G, n, vxx, vyy, vxy)
     for y in range(window[1], window[3]):
         if bent:
             _row_of_lens(lens, y, row_x, row_y)
-        for x in range(window[0], window[2]):
-            # Pixels come in pairs, so that neighbours can be compared however few are taken.
-            lot = (x >> 1) + y
-            if lot % stride != 0 and lot % flat_stride != 0:
+        # Pixels come in pairs, so that neighbours can be compared however few are taken.
+        pair = (window[0] >> 1) + (-((window[0] >> 1) + y)) % stride
+        for k in range(2 * max((window[2] - 2 * pair + 2 * stride - 1) // (2 * stride), 0)):
+            x = 2 * (pair + (k >> 1) * stride) + (k & 1)
+            if x < window[0] or x >= window[2]:
                 continue
             X, Y = float(x), float(y)
             if bent:
@@ -211,6 +229,14 @@ def linearise(
             s = (G[0, 0] * X + G[0, 1] * Y + G[0, 2]) * z
             t = (G[1, 0] * X + G[1, 1] * Y + G[1, 2]) * z
             if s <= 0.0 or t <= 0.0 or s >= n or t >= n:
+                continue
+            # Most pixels see one cell only: this tells it of them at a third of the price.
+            from_s, from_t = s - math.floor(s), t - math.floor(t)
+            if (
+                min(from_s, 1.0 - from_s) > reach_s
+                and min(from_t, 1.0 - from_t) > reach_t
+                and ((x >> 1) + y) % flat_stride != 0
+            ):
                 continue
             sx, sy = (G[0, 0] - s * G[2, 0]) * z, (G[0, 1] - s * G[2, 1]) * z
             tx, ty = (G[1, 0] - t * G[2, 0]) * z, (G[1, 1] - t * G[2, 1]) * z
@@ -224,7 +250,7 @@ def linearise(
                 continue
             column, row = int(s), int(t)
             near = _sees_an_edge(cells, n, s, t, NEAR * sigma_s, NEAR * sigma_t, column, row)
-            if lot % (stride if near else flat_stride) != 0:
+            if not near and ((x >> 1) + y) % flat_stride != 0:
                 continue
             if any_masked:
                 a, b = min(2.0 * sigma_s, 1.0), min(2.0 * sigma_t, 1.0)
@@ -322,15 +348,15 @@ def linearise(
 
 
 @numba.njit(cache=True, fastmath=True, error_model="numpy")
-def brightness(cells, n, G, X, Y, par):
-    """Blurred print at an undistorted pixel, 0 black to 1 white; parameters as of `linearise`."""
+def brightness(cells, n, G, X, Y, par, scratch):
+    """Blurred print at an undistorted pixel, 0 black to 1 white; parameters as of `linearise`, `scratch` (5, 26)."""
     z = 1.0 / (G[2, 0] * X + G[2, 1] * Y + G[2, 2])
     s = (G[0, 0] * X + G[0, 1] * Y + G[0, 2]) * z
     t = (G[1, 0] * X + G[1, 1] * Y + G[1, 2]) * z
     sx, sy = (G[0, 0] - s * G[2, 0]) * z, (G[0, 1] - s * G[2, 1]) * z
     tx, ty = (G[1, 0] - t * G[2, 0]) * z, (G[1, 1] - t * G[2, 1]) * z
     vxx, vyy, vxy = par[BLUR] + par[BLUR + 1], par[BLUR] - par[BLUR + 1], par[BLUR + 2]
-    w, e, d, dd, ddd = np.empty(26), np.empty(26), np.empty(26), np.empty(26), np.empty(26)
+    w, e, d, dd, ddd = scratch[0], scratch[1], scratch[2], scratch[3], scratch[4]
     sigma_s = math.sqrt(max(sx * sx * vxx + 2.0 * sx * sy * vxy + sy * sy * vyy, 1e-12))
     sigma_t = math.sqrt(max(tx * tx * vxx + 2.0 * tx * ty * vxy + ty * ty * vyy, 1e-12))
     i0, columns = _weights(s, sigma_s, n, w, d, dd, ddd)

@@ -151,7 +151,7 @@ def level(r, who, m, n, par, masked, levels):
 def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
     """Cells, masked or not, whose middle is not as bright as it should be: of all, and of those that carry the id."""
     height, width = grey.shape
-    G = np.linalg.inv(H)
+    G, scratch = np.linalg.inv(H), np.empty((5, 26))
     every, within = 0, 0
     for j in range(n):
         for i in range(n):
@@ -166,7 +166,7 @@ def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
             seen = (1 - b) * ((1 - a) * grey[top, left] + a * grey[top, left + 1]) + b * (
                 (1 - a) * grey[top + 1, left] + a * grey[top + 1, left + 1]
             )
-            T = brightness(levels, n, G, X, Y, par)
+            T = brightness(levels, n, G, X, Y, par, scratch)
             u, v = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
             model = par[OFFSET] + par[2] * u + par[3] * v + (par[GAIN] + par[4] * u + par[5] * v) * T
             if abs(seen - min(model, 255.0)) > 0.4 * par[GAIN] or abs(levels[j, i] - cells[j, i]) > 0.65:

@@ -7,6 +7,8 @@ wrong by 5 to 8 of their sigmas; 295 were after, and one of them wrong.
 
 from __future__ import annotations
 
+import math
+
 import numba
 import numpy as np
 
@@ -31,6 +33,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
     """
     lens, bent, norm, window, quiet, _, _, _ = place
     coarse, _, flat = strides
+    coarse *= 2
     J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
     nothing = np.zeros_like(masked)
     rms = np.empty(n * n)
@@ -40,7 +43,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
         trial_H, trial_par = first_H.copy(), first_par.copy()
         if part > 0:
             held = _held_out(part, n, masked.shape[0])
-            for _ in range(3):
+            for _ in range(2):
                 trial_H, used, _, _, step_px = step(
                     grey, cells, n, held, trial_H, trial_par, prior, place, coarse, flat, False, (J, r, who)
                 )
@@ -48,7 +51,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
                     break
         m = linearise(
             grey, cells, n, nothing, False, lens, bent, np.linalg.inv(trial_H), norm, trial_par, window,
-            coarse, max(flat, coarse), quiet, J, r, who,
+            coarse, coarse * math.ceil(flat / coarse), quiet, J, r, who,
         )  # fmt: skip
         rms_of_cells(r, who, m, n, rms)
         cap, total = 0.12 * first_par[GAIN], 0.0

@@ -37,6 +37,7 @@ MISSING = "not found again"
 LOST = "lost with a worker"
 
 GLANCE_DECIMATE = 4.0
+SWEEP_DECIMATE = 2.0
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,14 @@ class Finders:
     def __init__(self, search: Search):
         self._search = search
         settings = search.settings
-        coarse = max(GLANCE_DECIMATE, settings.quad_decimate)
         self._finder = TagFinder(search.families, settings)
-        self._glancer = TagFinder(search.families, settings.model_copy(update={"quad_decimate": coarse}))
+        self._sweeper, self._glancer = (
+            TagFinder(
+                search.families,
+                settings.model_copy(update={"quad_decimate": max(decimate, settings.quad_decimate)}),
+            )
+            for decimate in (SWEEP_DECIMATE, GLANCE_DECIMATE)
+        )
         self._decoder = WindowDecoder(settings)
         self._followers: dict[str, Follower] = {}
 
@@ -83,6 +89,7 @@ class Finders:
             intrinsics = self._search.intrinsics.get(camera)
             self._followers[camera] = Follower(
                 self._finder,
+                self._sweeper,
                 self._glancer,
                 Refiner(None if intrinsics is None else np.array(intrinsics)),
                 self._decoder,

@@ -16,13 +16,13 @@ import numpy as np
 
 from pipeline.logs.reader import Frame, LogReader
 
-SPAN_S = 10.0
-"""Between keys. At 10 Hz a search of every 100th frame costs a fifth of decoding them all; with glances in between,
+SPAN_S = 20.0
+"""Between keys. At 10 Hz a search of every 200th frame costs a tenth of decoding them all; with glances in between,
 spans of 5 s found nothing more on rendered logs."""
-SPAN_BYTES = 128_000_000
+SPAN_BYTES = 256_000_000
 """Pictures of a span are kept for the way back, decoded; spans of many or large pictures are cut shorter."""
 FEWEST_FRAMES = 8
-SLICE_S = 30.0
+SLICE_S = 60.0
 """What a kill costs at most, per worker. Each slice searches one key that its neighbour searches too: twice as long
 would save 1 % of the time."""
 

@@ -282,7 +282,7 @@ def test_response_is_the_parabola_through_black_and_white(q):
     G, par = bent.G, bent.parameters()
     brightness = np.array(
         [
-            image_model.brightness(bent.cells, CELLS, G, float(x), float(y), par)
+            image_model.brightness(bent.cells, CELLS, G, float(x), float(y), par, np.empty((5, 26)))
             for y, x in zip(*np.nonzero(use))
         ]
     )
