@@ -35,7 +35,7 @@ from pipeline.detection.seen import (
 )
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
-GLANCE_S = 2.5
+GLANCE_S = 1.5
 """Between two glances: searches of the frame decimated by four. They take a twelfth of a search and miss tags under
 some 40 px; what comes from behind something and goes again within a span is found by them."""
 GLANCE_SHARE = 0.15
