@@ -35,6 +35,23 @@ class MovingBody(Section):
     kind: Literal["moving"]
 
 
+class Belt(Section):
+    """A timing belt or gear that turns a joint with another one, as the paper's flip marker (Fig. 5)."""
+
+    joint: Name
+    """The joint that drives this one; both turn about axes of their own."""
+    ratio: Annotated[float, Field(ge=-1, le=1)] = 1.0
+    """Turn of this joint per turn of that one: teeth over teeth, so exact; negative if they turn against each other.
+    What the belt is off by when it is put on is an error of this joint's `axis` about z: state it in its `sigma_deg`.
+    A faster marker (beyond 1) would leave the driving angle ambiguous by a part of a turn."""
+
+    @model_validator(mode="after")
+    def _turns(self) -> Belt:
+        if self.ratio == 0:
+            raise ValueError("ratio 0 would not turn at all; give teeth over teeth, at most 1")
+        return self
+
+
 class JointBody(Section):
     """A body that turns about an axis of its parent; one angle per epoch."""
 
@@ -42,6 +59,8 @@ class JointBody(Section):
     parent: Name
     axis: Pose
     """``T_parent_axis``: the child turns about the z axis of this frame; at angle 0 the child frame equals it."""
+    follows: Belt | None = None
+    """Left out: the joint has an angle of its own. Given: its angle is that of another joint times the belt's ratio."""
 
 
 class StaticBody(Section):
@@ -245,6 +264,13 @@ class Machine(Section):
                 raise ValueError(
                     f"sensors.{name}.joint names '{sensor.joint}', which is no body of kind 'joint'"
                 )
+            self._refuse_driven(f"sensors.{name}.joint", sensor.joint)
+        for name, driven in self.bodies.items():
+            if isinstance(driven, JointBody) and driven.follows is not None:
+                key, driver = f"bodies.{name}.follows.joint", driven.follows.joint
+                if not isinstance(self.bodies.get(driver), JointBody):
+                    raise ValueError(f"{key} names '{driver}', which is no body of kind 'joint'")
+                self._refuse_driven(key, driver)
         for name in self.bodies:
             seen, at = {name}, name
             while isinstance(body_ := self.bodies.get(at), JointBody):
@@ -253,6 +279,13 @@ class Machine(Section):
                     raise ValueError(f"bodies.{name}: its parents run in a circle")
                 seen.add(at)
         return self
+
+    def _refuse_driven(self, key: str, joint: str) -> None:
+        body = self.bodies[joint]
+        if isinstance(body, JointBody) and body.follows is not None:
+            raise ValueError(
+                f"{key} names '{joint}', which has no angle of its own: name '{body.follows.joint}', which it follows"
+            )
 
     def with_calibrations(self, calibrations: Mapping[str, Mapping[str, Any]], source: str) -> Machine:
         """This machine with the intrinsics that it leaves out taken from the log.

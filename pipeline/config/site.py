@@ -184,7 +184,8 @@ class Site(Section):
     format: Literal["gradetrace/site/1"]
     site: SiteIdentity
     grid: Grid
-    benchmarks: Annotated[dict[Name, Benchmark], Field(min_length=1)]
+    benchmarks: dict[Name, Benchmark] = {}
+    """None are needed where a surveyed site camera (`body = "world"` in machine.toml) sees the machine."""
     alignment: Alignment | None = None
     design: Design
     tolerance: Tolerance

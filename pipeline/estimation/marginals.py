@@ -86,9 +86,10 @@ def body_track(problem: Problem, values: Values, found: Marginals, frame: str, n
         c, at = problem.place(index)
         J_x = J_chain.setdefault(c, np.zeros((E, 6, problem.chain_size(c))))
         if step.edge.kind == "joint":
-            J_x[:, :, at.start] += J[:, :, 5]
-            J_x[:, :, at.start + 1] -= J[:, :, 5] * problem.statics.clock_error(index, values.z)
-            turning = J[:, :, 5] * values.rate[index][:, None]
+            J_turn = step.edge.ratio * J[:, :, 5]
+            J_x[:, :, at.start] += J_turn
+            J_x[:, :, at.start + 1] -= J_turn * problem.statics.clock_error(index, values.z)
+            turning = J_turn * values.rate[index][:, None]
             velocity += turning
             clock = problem.statics.clocks[index]
             if clock is not None:

@@ -92,11 +92,14 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
         # d p_camera = R [I, -hat(p_child)] xi; a' hat(b) = (a x b)', row by row.
         if step.edge.kind == "joint":
             J_turn = -np.cross(J_rho, p_child[:, :, None, :])[..., TURN_COLUMN - 3].reshape(n, 8)
-            by_variable[index] = J_turn[..., None] * np.array([1.0, -statics.clock_error(index, values.z)])
+            J_turn = step.edge.ratio * J_turn
+            J = J_turn[..., None] * np.array([1.0, -statics.clock_error(index, values.z)])
+            by_variable[index] = by_variable.get(index, 0.0) + J  # a belt may bring one angle in twice
             clock = statics.clocks[index]
             if clock is not None and len(statics.columns[clock]):
                 J_clock = -J_turn * values.rate[index][corners.epoch][:, None]
-                by_static[clock] = J_clock[..., None] @ statics.sensitivity(clock, values.z)
+                J = J_clock[..., None] @ statics.sensitivity(clock, values.z)
+                by_static[clock] = by_static.get(clock, 0.0) + J
             continue
         J = np.concatenate([J_rho, -np.cross(J_rho, p_child[:, :, None, :])], axis=-1)
         if step.edge.kind == "moving":

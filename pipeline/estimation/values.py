@@ -97,4 +97,5 @@ class Values:
         value = self.pose[edge.index][epoch]
         if edge.kind == "moving":
             return value
-        return fr.turn(value - self.rate[edge.index][epoch] * statics.clock_error(edge.index, self.z))
+        angle = value - self.rate[edge.index][epoch] * statics.clock_error(edge.index, self.z)
+        return fr.turn(edge.ratio * angle)

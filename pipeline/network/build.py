@@ -65,7 +65,8 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
         densities = (motion.translation, motion.rotation)
         if isinstance(body, JointBody):
             axis = add_pose(f"joint {name} axis", "linkage and sensor", body.axis)
-            bodies[name] = Body(name, "joint", body.parent, axis, densities)
+            driver, ratio = (None, 1.0) if body.follows is None else (body.follows.joint, body.follows.ratio)
+            bodies[name] = Body(name, "joint", body.parent, axis, densities, driver, ratio)
         elif isinstance(body, StaticBody):
             bodies[name] = Body(name, "static", None, add(_static_body(name, body)))
         else:

@@ -9,7 +9,7 @@ iterations did not converge.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -51,6 +51,7 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
 
     variables: list[fr.Variable] = []
     edges: dict[str, fr.Edge] = {}
+    angles: dict[str, int] = {}
     left_out: list[str] = []
     for name in _parents_first(network):
         body = network.bodies[name]
@@ -69,12 +70,19 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
             variables.append(fr.Variable(name, "moving", body.motion))
         elif body.kind == "joint":
             assert body.static is not None and body.parent is not None
-            if _root(network, name) in left_out or not (name in read or _joint_in_view(network, name, pairs)):
+            angle = body.follows or name
+            turned = [n for n, b in network.bodies.items() if n == angle or b.follows == angle]
+            if set(_lineage(network, name)) & set(left_out) or not (
+                angle in read or any(_joint_in_view(network, n, pairs) for n in turned)
+            ):
                 left_out.append(name)
                 continue
             edges[fr.axis_frame(name)] = fr.Edge(fr.body_frame(body.parent), "static", body.static)
-            edges[frame] = fr.Edge(fr.axis_frame(name), "joint", len(variables))
-            variables.append(fr.Variable(name, "joint", body.motion, read.get(name)))
+            if angle not in angles:
+                angles[angle] = len(variables)
+                motion = network.bodies[angle].motion
+                variables.append(fr.Variable(angle, "joint", motion, read.get(angle)))
+            edges[frame] = fr.Edge(fr.axis_frame(name), "joint", angles[angle], body.ratio)
     # A joint hangs on its parent: where the parent is left out, so are its children.
     gone = {n for n in network.bodies if set(_lineage(network, n)) & set(left_out)}
     needed = [n for n in _needed(network, anchors) if n in gone]
@@ -87,12 +95,9 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
             _why_not_tied(network, name, pairs, set(network.bodies) - gone).split("; ")[0]
             + ": left out of the adjustment"
         )
-    kept = [k for k, v in enumerate(variables) if v.body not in gone]
+    kept = sorted({e.index for e in edges.values() if e.kind != "static"})
     renumbered = {old: new for new, old in enumerate(kept)}
-    edges = {
-        f: e if e.kind == "static" else fr.Edge(e.parent, e.kind, renumbered[e.index])
-        for f, e in edges.items()
-    }
+    edges = {f: e if e.kind == "static" else replace(e, index=renumbered[e.index]) for f, e in edges.items()}
     for camera in network.cameras:
         if camera.body not in gone:
             edges[fr.camera_frame(camera.name)] = fr.Edge(fr.body_frame(camera.body), "static", camera.mount)

@@ -43,6 +43,8 @@ class Edge:
     """static, moving or joint."""
     index: int
     """Of the static, or of the variable."""
+    ratio: float = 1.0
+    """Of a joint that a belt drives: its turn per turn of the variable's angle."""
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,10 @@ class Body:
     """Index of the pose of a static body, or of the axis ``T_parent_axis`` of a joint."""
     motion: tuple[float, float] = (0.0, 0.0)
     """Spectral densities of white-noise acceleration, m²/s³ and rad²/s³; a joint uses the second."""
+    follows: str | None = None
+    """Of a joint without an angle of its own: the joint that drives it."""
+    ratio: float = 1.0
+    """Its turn per turn of that joint."""
 
 
 @dataclass(frozen=True)

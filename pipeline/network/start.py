@@ -105,7 +105,7 @@ class _Search:
         if edge.kind == "static":
             return self.statics[edge.index]
         value = self.pose[edge.index][epoch]
-        return value if edge.kind == "moving" else fr.turn(value)
+        return value if edge.kind == "moving" else fr.turn(edge.ratio * value)
 
     def take_sensor(self, index: int) -> None:
         sensor, data = self.network.sensors[index], self.epochs.sensors[index]
@@ -160,12 +160,14 @@ class _Search:
         around = []
         for j, view in enumerate(views):
             rows = np.searchsorted(knots, view.epoch)
-            before, after, sign = self._around(view, key)
-            around.append((rows, before, after, sign))
+            before, after, step = self._around(view, key)
+            edge = step.edge
+            around.append((rows, before, after, step))
             E = se3.inverse(before)[:, None] @ view.poses @ se3.inverse(after)[:, None]
-            E = se3.inverse(E) if sign < 0 else E
+            E = se3.inverse(E) if step.sign < 0 else E
             if key[0] == "joint":
-                E = fr.turn(np.arctan2(E[..., 1, 0] - E[..., 0, 1], E[..., 0, 0] + E[..., 1, 1]))
+                turned = np.arctan2(E[..., 1, 0] - E[..., 0, 1], E[..., 0, 0] + E[..., 1, 1])
+                E = fr.turn(turned / edge.ratio)
             candidates[rows, 2 * j : 2 * j + 2] = E
             misfit[rows, 2 * j : 2 * j + 2] = view.misfit
         cost, middle_px = _score(candidates, views, around)
@@ -184,7 +186,7 @@ class _Search:
         self.unknown.remove(key)
 
     def _around(self, view: _View, key):
-        """The known parts of a view's path before and after the unknown edge, (F, 4, 4) each, and its sign."""
+        """The known parts of a view's path before and after the unknown edge, (F, 4, 4) each, and that step."""
         at = [_key(step) for step in view.path].index(key)
 
         def edge_pose(edge):
@@ -193,7 +195,7 @@ class _Search:
         shape = (len(view.epoch), 4, 4)
         before = np.broadcast_to(fr.along(view.path[:at], edge_pose)[1], shape)
         after = np.broadcast_to(fr.along(view.path[at + 1 :], edge_pose)[1], shape)
-        return before, after, view.path[at].sign
+        return before, after, view.path[at]
 
     def _interpolate(self, key, t, E) -> None:
         if key[0] == "joint":
@@ -308,9 +310,11 @@ def _score(candidates, views, around):
     """Reprojection of every candidate in all pictures of its epoch: whitened cost, and the mean corner in px."""
     total = np.zeros(candidates.shape[:2])
     worst = np.zeros(candidates.shape[:2])
-    for view, (rows, before, after, sign) in zip(views, around, strict=True):
+    for view, (rows, before, after, step) in zip(views, around, strict=True):
         E = candidates[rows]
-        T = before[:, None] @ (se3.inverse(E) if sign < 0 else E) @ after[:, None]
+        if step.edge.ratio != 1.0:
+            E = fr.turn(step.edge.ratio * np.arctan2(E[..., 1, 0], E[..., 0, 0]))
+        T = before[:, None] @ (se3.inverse(E) if step.sign < 0 else E) @ after[:, None]
         off = _off(T, view.p_marker, view.xy, view.focal_px)
         total[rows] += np.sum(np.where(view.seen[:, None], off, 0.0) ** 2, axis=-1)
         middle = np.sum(np.where(view.seen[:, None], off, 0.0), axis=-1) / view.seen.sum(-1)[:, None]
