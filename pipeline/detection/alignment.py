@@ -59,13 +59,13 @@ UNEVEN = 4.0
 """`unevenness` from which each cell gets a brightness of its own; noise and JPEG gave up to 2.8, shadows 20 to 40."""
 UNEVEN_VARIANCE = 5.5
 """What free brightness of the cells adds to the variance of corners, measured on shadows that pass over tags."""
-PARTLY, PARTLY_VARIANCE = 0.03, 5.0
+PARTLY, PARTLY_VARIANCE, PARTLY_MISFIT = 0.015, 3.0, 0.02
 """Part of the cells that are masked from which something lies over the print, and what it adds to the variance of
-corners by what of it is too little to be masked."""
+corners by what of it is too little to be masked; twice that at a misfit of the third, five times at twice the third."""
 PARTLY_PX = 0.015
 """What it adds besides, on large tags that the noise alone would leave more certain than that."""
 MISFIT_MOST_PARTLY = 0.07
-"""As `MISFIT_MOST`, where something lies over the print: half-covered prints at their true place gave below 0.06."""
+"""As `MISFIT_MOST`, where twice `PARTLY` is masked: half-covered prints at their true place gave below 0.06."""
 CLIPPED, CLIPPED_VARIANCE = 0.05, 4.5
 """Part of the pixels that are whiter than the camera could record, and what the half of each edge that is lost with
 them, and JPEG's ringing beside it, add to the variance of corners."""
@@ -208,7 +208,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
             reason = MISFIT
         elif misfit > (MISFIT_MOST_SHARP if blur_cells < SHARP else MISFIT_MOST):
             reason = BLURRED if blur_cells > 0.7 else MISFIT
-        elif partly and misfit > MISFIT_MOST_PARTLY:
+        elif share < 1.0 - 2.0 * PARTLY and misfit > MISFIT_MOST_PARTLY:
             reason = COVERED
         else:
             every, within = contradicted(grey, cells, levels, n, lens, bent, H, norm, par)
@@ -220,6 +220,8 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         sigma *= math.sqrt(UNEVEN_VARIANCE)
     elif partly:
         sigma *= math.sqrt(PARTLY_VARIANCE)
+    if partly:
+        sigma *= math.sqrt(1.0 + (misfit / PARTLY_MISFIT) ** 2)
     if clipped > CLIPPED * m:
         sigma *= math.sqrt(CLIPPED_VARIANCE)
     if reason == STANDS:
