@@ -36,7 +36,8 @@ OFFSET, GAIN, PLACE, BLUR, RESPONSE, GROUND, PARAMETERS = 0, 1, 6, 14, 17, 18, 2
 REACH = 3.3
 """Sigmas beyond which an edge is not felt: 0.0005 of the contrast."""
 NEAR = 2.6
-"""Sigmas from an edge beyond which a pixel tells next to nothing of it; 2.1 saved a fifth and cost 5 % after JPEG."""
+"""Sigmas from an edge beyond which a pixel tells next to nothing of it; after JPEG, what lies between 2.1
+and this still makes corners up to 5 % better."""
 FLAT, ON_EDGE, AT_END = 0, 1, 2
 NEARLY_WHITE = 243.0
 """What JPEG leaves of white that a camera could not record."""
