@@ -119,8 +119,8 @@ class Camera(Section):
     """Topic of its images in the log."""
     body: Name = "world"
     """The body that carries it; `world` for a site camera whose mount is its surveyed pose in the world."""
-    mount: Pose
-    """``T_body_camera``; camera axes x right, y down, z forward."""
+    mount: Pose | None = None
+    """``T_body_camera``; camera axes x right, y down, z forward. Left out: unknown, the log must tell."""
     intrinsics: Intrinsics | None = None
     """Left out: taken from the log's camera calibration topic, with `intrinsics_sigma`."""
     calibration_topic: str | None = None
@@ -131,8 +131,8 @@ class Camera(Section):
 
 class Marker(Print):
     body: Name
-    mount: Pose
-    """``T_body_marker``; marker axes x right, y up, z out of the print."""
+    mount: Pose | None = None
+    """``T_body_marker``; marker axes x right, y up, z out of the print. Left out: unknown, the log must tell."""
 
 
 class Curve(Section):

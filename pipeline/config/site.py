@@ -83,7 +83,7 @@ class SurveyedCorner(Section):
 
 
 class Benchmark(Print):
-    """A marker fixed on the site: its surveyed pose, or three or more surveyed corners."""
+    """A marker fixed on the site: its surveyed pose, or three or more surveyed corners; neither: the log must tell."""
 
     pose: SurveyedPose | None = None
     corners: tuple[SurveyedCorner, ...] = ()
@@ -91,8 +91,13 @@ class Benchmark(Print):
 
     @model_validator(mode="after")
     def _one_survey(self) -> Benchmark:
-        if (self.pose is None) == (not self.corners):
-            raise ValueError("give either pose, or at least three surveyed corners with sigma_corner_mm")
+        if self.pose is not None and self.corners:
+            raise ValueError(
+                "give either pose, or at least three surveyed corners with sigma_corner_mm, or neither: "
+                "then the log must tell where the marker is"
+            )
+        if not self.corners and self.sigma_corner_mm is not None:
+            raise ValueError("sigma_corner_mm goes with surveyed corners, and there are none")
         if self.corners and (len(self.corners) < 3 or self.sigma_corner_mm is None):
             raise ValueError("surveyed corners need at least three of them and sigma_corner_mm")
         ids = {tag.id for tag in self.tags}
@@ -102,6 +107,11 @@ class Benchmark(Print):
                     f"a corner of tag {shot.tag} was surveyed, but the tags of this benchmark are {sorted(ids)}"
                 )
         return self
+
+    @property
+    def is_surveyed(self) -> bool:
+        """False where the log alone must tell its pose."""
+        return self.pose is not None or bool(self.corners)
 
 
 class Alignment(Section):
@@ -209,6 +219,8 @@ class Site(Section):
                         f"tag {tag.id} of {mark.family} stands on two benchmarks, {other} and {name}"
                     )
         for name, mark in self.benchmarks.items():
+            if not mark.is_surveyed:
+                continue
             shots = [mark.pose.enh] if mark.pose else [shot.enh for shot in mark.corners]
             away_m = max(float(np.linalg.norm(self.grid.to_world(np.array(enh)))) for enh in shots)
             if away_m > MAX_FROM_ORIGIN_M:
@@ -225,7 +237,7 @@ class Site(Section):
         return self.survey.station_step_m or (0.5 if self.grid.unit == "m" else 2 * self.grid.metres_per_unit)
 
     def benchmark_pose(self, name: str) -> Pose | None:
-        """Surveyed pose of a benchmark in the world (metres), or None where corners were surveyed."""
+        """Surveyed pose of a benchmark in the world (metres), or None where corners were surveyed, or nothing."""
         pose = self.benchmarks[name].pose
         if pose is None:
             return None

@@ -212,14 +212,13 @@ def static_results(problem: Problem, values: Values, found: Marginals) -> list[S
         after = J @ found.P_zz[np.ix_(columns, columns)] @ J.T
         base = problem.statics.base[k]
         if static.is_pose:
-            # To first order, so that a rotation vector near pi does not jump to the other sign.
-            phi = so3.log(base[:3, :3])
-            chart = np.zeros((6, 6))
-            chart[:3, :3], chart[3:, 3:] = base[:3, :3], so3.Jr_inv(phi)
-            file_value = np.concatenate([base[:3, 3], phi])
-            correction, prior, after = chart @ correction, chart @ prior @ chart.T, chart @ after @ chart.T
+            T = problem.statics.value(k, values.z)
+            file_value = np.concatenate([base[:3, 3], so3.log(base[:3, :3])])
+            value = np.concatenate([T[:3, 3], _nearest_turn(so3.log(T[:3, :3]), file_value[3:])])
+            before, chart = _chart(base, file_value[3:]), _chart(T, value[3:])
+            correction, prior, after = before @ correction, before @ prior @ before.T, chart @ after @ chart.T
         else:
-            file_value = base
+            file_value, value = base, base + correction
         prior_sigma = np.sqrt(np.maximum(np.diagonal(prior), 0.0))
         free = prior_sigma > 0
         shift = np.where(free, correction / np.where(free, prior_sigma, 1.0), 0.0)
@@ -230,13 +229,29 @@ def static_results(problem: Problem, values: Values, found: Marginals) -> list[S
                 static.components,
                 static.units,
                 file_value,
-                file_value + correction,
+                value,
                 prior_sigma,
                 np.sqrt(np.maximum(np.diagonal(after), 0.0)),
                 shift,
             )
         )
     return results
+
+
+def _chart(T, phi):
+    """(6, 6) change of origin and rotation vector of a pose by a perturbation on its right."""
+    chart = np.zeros((6, 6))
+    chart[:3, :3], chart[3:, 3:] = T[:3, :3], so3.Jr_inv(phi)
+    return chart
+
+
+def _nearest_turn(phi, near):
+    """Of the two rotation vectors about half a turn that mean the same the one nearer to another."""
+    angle = np.linalg.norm(phi)
+    if angle < 0.5 * np.pi:
+        return phi
+    other = phi * (1 - 2 * np.pi / angle)
+    return other if np.linalg.norm(other - near) < np.linalg.norm(phi - near) else phi
 
 
 def moved_statics(results: list[StaticResult]) -> list[str]:

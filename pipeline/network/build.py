@@ -27,7 +27,7 @@ from pipeline.network.model import (
 JOINT_MOTION = Motion(translation=1e-9, rotation=1.0)
 """A bucket goes from rest to 60 deg/s in less than a second, which is ten times what a whole body does."""
 UNKNOWN_SIGMA = np.array([1000.0] * 3 + [3.0] * 3)
-"""Prior of a static body's pose that nobody surveyed, about the start that the log gives: m and rad."""
+"""Prior of a pose that no file gives, about the start that the log gives: m and rad."""
 
 
 def network_of(machine: Machine, site: Site, date: datetime.date | None = None) -> Network:
@@ -55,7 +55,9 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
         statics.append(static)
         return len(statics) - 1
 
-    def add_pose(name: str, source: str, pose: Pose) -> int:
+    def add_pose(name: str, source: str, pose: Pose | None) -> int:
+        if pose is None:
+            return add(_unknown_pose(name, source))
         return add(_pose_static(name, source, pose.transform(), pose.covariance_xi()))
 
     bodies = {"world": Body("world", "world")}
@@ -68,7 +70,7 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
             driver, ratio = (None, 1.0) if body.follows is None else (body.follows.joint, body.follows.ratio)
             bodies[name] = Body(name, "joint", body.parent, axis, densities, driver, ratio)
         elif isinstance(body, StaticBody):
-            bodies[name] = Body(name, "static", None, add(_static_body(name, body)))
+            bodies[name] = Body(name, "static", None, add_pose(f"body {name} pose", "mounts", body.pose))
         else:
             bodies[name] = Body(name, "moving", motion=densities)
 
@@ -106,10 +108,10 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
             )
         pose = site.benchmark_pose(name)
         static_name = f"benchmark {name} pose"
-        if pose is not None:
-            index = add_pose(static_name, "benchmarks", pose)
-        else:
+        if mark.corners:
             index = add(_pose_static(static_name, "benchmarks", *_fit_corners(name, mark, site)))
+        else:
+            index = add_pose(static_name, "benchmarks", pose)
         markers.append(Marker(name, "world", index, True))
         prints.append(mark)
     tags = [(k, item.family, tag) for k, item in enumerate(prints) for tag in item.tags]
@@ -205,11 +207,9 @@ def _pose_static(name, source, T, covariance) -> Static:
     return Static(name, source, True, T, covariance, POSE_COMPONENTS, POSE_UNITS)
 
 
-def _static_body(name: str, body: StaticBody) -> Static:
-    if body.pose is not None:
-        return _pose_static(f"body {name} pose", "mounts", body.pose.transform(), body.pose.covariance_xi())
+def _unknown_pose(name: str, source: str) -> Static:
     cov = np.diag(UNKNOWN_SIGMA**2)
-    return Static(f"body {name} pose", "mounts", True, np.eye(4), cov, POSE_COMPONENTS, POSE_UNITS, False)
+    return Static(name, source, True, np.eye(4), cov, POSE_COMPONENTS, POSE_UNITS, False)
 
 
 def _fit_corners(name: str, mark: Benchmark, site: Site):

@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.errors import NetworkError
 from pipeline.network import frames as fr
-from pipeline.network.model import Network, Observations, Readings
+from pipeline.network.model import Camera, Marker, Network, Observations, Readings
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,8 +46,8 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
         for s in reversed(network.sensors)
         if s.name in readings and len(readings[s.name].time_ns)
     }
-    warnings = _unseen(network, pairs)
     anchors = _anchors(network, pairs)
+    warnings = _unseen(network, pairs) + _adrift(network, pairs, anchors)
 
     variables: list[fr.Variable] = []
     edges: dict[str, fr.Edge] = {}
@@ -99,10 +99,10 @@ def tie(network: Network, observations: Observations, readings: dict[str, Readin
     renumbered = {old: new for new, old in enumerate(kept)}
     edges = {f: e if e.kind == "static" else replace(e, index=renumbered[e.index]) for f, e in edges.items()}
     for camera in network.cameras:
-        if camera.body not in gone:
+        if camera.body not in gone and _camera_end(network, camera) in anchors:
             edges[fr.camera_frame(camera.name)] = fr.Edge(fr.body_frame(camera.body), "static", camera.mount)
     for marker in network.markers:
-        if marker.body not in gone:
+        if marker.body not in gone and _marker_end(network, marker) in anchors:
             edges[fr.marker_frame(marker.name)] = fr.Edge(fr.body_frame(marker.body), "static", marker.mount)
     edges[fr.TOOL] = fr.Edge(fr.body_frame(network.tool_body), "static", network.tool)
     frames = fr.Frames(edges)
@@ -132,8 +132,23 @@ def _parents_first(network: Network) -> list[str]:
     )
 
 
+def _camera_end(network: Network, camera: Camera) -> str:
+    """What a camera's observations tie: the body that carries it, or, where its mount is unknown, only itself."""
+    if network.statics[camera.mount].surveyed:
+        return _root(network, camera.body)
+    return fr.camera_frame(camera.name)
+
+
+def _marker_end(network: Network, marker: Marker) -> str:
+    if network.statics[marker.mount].surveyed:
+        return _root(network, marker.body)
+    return fr.marker_frame(marker.name)
+
+
 def _is_datum(network: Network, root: str) -> bool:
-    body = network.bodies[root]
+    body = network.bodies.get(root)
+    if body is None:
+        return False  # a camera or marker whose own mount is unknown
     if body.kind == "world":
         return True
     return body.kind == "static" and body.static is not None and network.statics[body.static].surveyed
@@ -217,7 +232,7 @@ def _why_not_tied(network: Network, name: str, pairs: Counter, tied: set[str]) -
     family = [n for n in network.bodies if _root(network, n) in tied_together]
     cameras = [c.name for c in network.cameras if c.body in family]
     markers = [m.name for m in network.markers if m.body in family]
-    surveyed = [m.name for m in network.markers if m.benchmark]
+    surveyed = [m.name for m in network.markers if m.benchmark and network.statics[m.mount].surveyed]
     bodies = (
         f"body {_listed(roots)} is" if len(roots) == 1 else f"bodies {_listed(roots)} see each other but are"
     )

@@ -33,7 +33,7 @@ class Static:
     components: tuple[str, ...]
     units: tuple[str, ...]
     surveyed: bool = True
-    """False for the pose of a static body that the log alone must tell."""
+    """False for a pose that the log alone must tell: a static body, mount or benchmark that no file gives."""
 
     @property
     def scale(self) -> np.ndarray:

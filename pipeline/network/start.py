@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -47,25 +46,13 @@ class Start:
     """Per static: its value; that of the file, unless nobody surveyed it."""
 
 
-@dataclass(frozen=True, eq=False)
-class _View:
-    """One marker in the frames of one camera."""
-
-    path: tuple[fr.Step, ...]
-    epoch: np.ndarray  # (F,)
-    p_marker: np.ndarray  # (m, 3)
-    xy: np.ndarray  # (F, m, 2) rays, 0 where not seen
-    seen: np.ndarray  # (F, m)
-    focal_px: float
-    poses: np.ndarray  # (F, 2, 4, 4) T_camera_marker
-    misfit: np.ndarray  # (F, 2) sum of its squared residuals, px²
-
-
 def start(network: Network, tie: Tie, epochs: Epochs) -> Start:
     """Starting values from the graph, the readings and the pictures.
 
-    Variables are taken one after the other, each from the views in which it alone is still unknown; between the
-    pictures poses follow the geodesic. A joint is started from its sensor where it has one.
+    What moves, and poses that no file gives, are taken one after the other, each from the pictures in which it alone is
+    still unknown. A pose so found may show where a body was in pictures that told nothing before, and these
+    where further markers hang: so the start grows outwards from the datum. Between the pictures poses follow the
+    geodesic. A joint is started from its sensor where it has one.
 
     Raises
     ------
@@ -75,12 +62,9 @@ def start(network: Network, tie: Tie, epochs: Epochs) -> Start:
     search = _Search(network, tie, epochs)
     for sensor in sorted(epochs.sensors):
         search.take_sensor(sensor)
-    while search.unknown:
-        edge = search.next_edge()
-        if edge is None:
-            search.assume_zero()
-        else:
-            search.take_views(edge)
+    while (keys := search.next_keys()) or search.relax():
+        for key in keys:
+            search.take_views(key)
     return Start(tuple(search.pose), tuple(search.rate), tuple(search.statics))
 
 
@@ -99,7 +83,11 @@ class _Search:
         self.unknown += [
             ("static", k) for k, s in enumerate(network.statics) if not s.surveyed and k in hanging
         ]
-        self.views = list(_views(network, tie, epochs))
+        self.known = np.zeros(
+            (len(tie.variables), n), dtype=bool
+        )  # at these epochs, from pictures or readings
+        self.asked = np.zeros((len(tie.variables), n), dtype=bool)  # there pictures were looked at already
+        self.views = list(views_of(network, tie, epochs))
 
     def edge_pose(self, edge: fr.Edge, epoch):
         if edge.kind == "static":
@@ -135,31 +123,69 @@ class _Search:
         self.pose[which] = np.interp(self.time_s, t, angle)
         after, before = np.interp(self.time_s + 0.1, t, angle), np.interp(self.time_s - 0.1, t, angle)
         self.rate[which] = (after - before) / 0.2
+        self.known[which] = self.asked[which] = True
         self.unknown.remove(("joint", which))
 
-    def next_edge(self) -> tuple[str, int] | None:
-        """The unknown that most pictures show with everything else on their path known."""
-        count = dict.fromkeys(self.unknown, 0)
-        for view in self.views:
-            open_ = [key for key in map(_key, view.path) if key in count]
-            if len(open_) == 1:
-                count[open_[0]] += len(view.epoch)
-        best = max(count, key=lambda key: count[key])
-        return best if count[best] else None
+    def next_keys(self) -> list[tuple[str, int]]:
+        """What to take next: what moves, if pictures show it at new epochs; else poses that no file gives.
 
-    def assume_zero(self) -> None:
-        """Nothing can be had alone any more: the first open joint starts at angle zero."""
-        joints = [key for key in self.unknown if key[0] == "joint"]
-        self.unknown.remove(joints[0] if joints else self.unknown[0])
+        Of those poses all that at least half as many pictures show as show the best one: where a few pictures alone
+        would place a tag, more come with the next round.
+        """
+        moving = dict.fromkeys(((v.kind, k) for k, v in enumerate(self.tie.variables)), 0)
+        still: dict[tuple[str, int], int] = {}
+        for view in self.views:
+            for key in set(map(_key, view.path)):
+                if key in moving:
+                    usable = self._usable(view, key)
+                    moving[key] += int(np.sum(usable & ~self.asked[key[1]][view.epoch]))
+                elif key in self.unknown:
+                    still[key] = still.get(key, 0) + int(np.sum(self._usable(view, key)))
+        if moving and max(moving.values()) > 0:
+            return [max(moving, key=lambda key: moving[key])]
+        most = max(still.values(), default=0)
+        return [key for key, count in still.items() if count and count >= 0.5 * most]
+
+    def _usable(self, view: View, key):
+        """In which frames of a view (F,) everything else on its path is known."""
+        keys = [_key(step) for step in view.path]
+        if keys.count(key) > 1 or any(k != key and k[0] == "static" and k in self.unknown for k in keys):
+            return np.zeros(len(view.epoch), dtype=bool)
+        usable = np.ones(len(view.epoch), dtype=bool)
+        for kind, index in keys:
+            if kind != "static" and (kind, index) != key:
+                usable &= self.known[index][view.epoch]
+        return usable
+
+    def relax(self) -> bool:
+        """Where no picture leads on: trust the geodesics across gaps; then, take a joint without pictures as zero."""
+        open_ = [key for key in self.unknown if key[0] != "static"]
+        taken = [k for k, v in enumerate(self.tie.variables) if (v.kind, k) not in open_]
+        if self.unknown and not np.all(self.known[taken]):
+            self.known[taken] = True
+            return True
+        if not open_:
+            return False
+        joints = [key for key in open_ if key[0] == "joint"]
+        key = joints[0] if joints else open_[0]
+        self.unknown.remove(key)
+        self.known[key[1]] = self.asked[key[1]] = True
+        return True
 
     def take_views(self, key: tuple[str, int]) -> None:
-        views = [v for v in self.views if [k for k in map(_key, v.path) if k in self.unknown] == [key]]
+        views = [
+            v.take(u) for v in self.views if key in map(_key, v.path) and np.any(u := self._usable(v, key))
+        ]
         knots = np.unique(np.concatenate([v.epoch for v in views]))
-        candidates = np.full((len(knots), 2 * len(views), 4, 4), np.nan)
-        misfit = np.full((len(knots), 2 * len(views)), np.nan)
+        rows_of = [np.searchsorted(knots, v.epoch) for v in views]
+        pictures = np.zeros(
+            len(knots), dtype=np.int64
+        )  # so far, of each knot: few of many markers are in one frame
+        width = 2 * int(np.bincount(np.concatenate(rows_of)).max())
+        candidates = np.full((len(knots), width, 4, 4), np.nan)
+        misfit = np.full((len(knots), width), np.nan)
         around = []
-        for j, view in enumerate(views):
-            rows = np.searchsorted(knots, view.epoch)
+        for view, rows in zip(views, rows_of, strict=True):
             before, after, step = self._around(view, key)
             edge = step.edge
             around.append((rows, before, after, step))
@@ -168,24 +194,35 @@ class _Search:
             if key[0] == "joint":
                 turned = np.arctan2(E[..., 1, 0] - E[..., 0, 1], E[..., 0, 0] + E[..., 1, 1])
                 E = fr.turn(turned / edge.ratio)
-            candidates[rows, 2 * j : 2 * j + 2] = E
-            misfit[rows, 2 * j : 2 * j + 2] = view.misfit
-        cost, middle_px = _score(candidates, views, around)
-        cost += _disagreement(candidates, misfit)
+            columns = 2 * pictures[rows, None] + np.arange(2)
+            candidates[rows[:, None], columns], misfit[rows[:, None], columns] = E, view.misfit
+            pictures[rows] += 1
+        cost, middle_px = score(candidates, views, around)
+        cost += disagreement(candidates, misfit)
         if key[0] == "static":
-            self.statics[key[1]] = _medoid(candidates, cost)
+            self.statics[key[1]] = most_agreed(candidates, misfit, cost)
         else:
-            chosen = _viterbi(candidates, cost, self.time_s[knots])
+            chosen = viterbi(candidates, cost, self.time_s[knots])
             rows = np.arange(len(knots))
             good = np.isfinite(cost[rows, chosen]) & (middle_px[rows, chosen] < LOST_PX)
             if np.sum(good) < 0.5 * len(knots):
                 good = np.isfinite(cost[rows, chosen])
             E = candidates[rows, chosen][good]
+            self.asked[key[1]][knots] = True
             if len(E):
                 self._interpolate(key, self.time_s[knots[good]], E)
-        self.unknown.remove(key)
+                self.known[key[1]] |= self._near(knots[good])
+        if key in self.unknown:
+            self.unknown.remove(key)
 
-    def _around(self, view: _View, key):
+    def _near(self, knots):
+        """(E,) bool: the knots, and what lies between two of them that are close to each other."""
+        epoch, t = np.arange(len(self.time_s)), self.time_s
+        before = knots[np.maximum(np.searchsorted(knots, epoch, side="right") - 1, 0)]
+        after = knots[np.minimum(np.searchsorted(knots, epoch), len(knots) - 1)]
+        return (before <= epoch) & (epoch <= after) & (t[after] - t[before] <= BRIDGE_S)
+
+    def _around(self, view: View, key):
         """The known parts of a view's path before and after the unknown edge, (F, 4, 4) each, and that step."""
         at = [_key(step) for step in view.path].index(key)
 
@@ -239,126 +276,3 @@ def geodesic(t, T, at):
 
 def _key(step: fr.Step) -> tuple[str, int]:
     return step.edge.kind, step.edge.index
-
-
-def _views(network: Network, tie: Tie, epochs: Epochs) -> Iterator[_View]:
-    seen = epochs.observations
-    marker_of = network.tag_marker[seen.tag]
-    for c, camera in enumerate(network.cameras):
-        intrinsics = network.statics[camera.intrinsics].value
-        for m, marker in enumerate(network.markers):
-            rows = np.flatnonzero((seen.camera == c) & (marker_of == m))
-            if len(rows) == 0:
-                continue
-            tags = np.flatnonzero(network.tag_marker == m)
-            frames, frame = np.unique(epochs.epoch[rows], return_inverse=True)
-            rays = np.full((len(frames), len(tags), 4, 2), np.nan)
-            rays[frame, np.searchsorted(tags, seen.tag[rows])] = camera_model.undistort(
-                seen.uv[rows], intrinsics
-            )
-            xy = rays.reshape(len(frames), -1, 2)
-            visible = np.isfinite(xy).all(axis=-1)
-            enough = visible.sum(-1) >= 4
-            xy, visible, frames = (
-                np.where(visible[..., None], xy, 0.0)[enough],
-                visible[enough],
-                frames[enough],
-            )
-            if len(frames) == 0:
-                continue
-            p = network.tag_corners[tags].reshape(-1, 3)
-            flat = np.broadcast_to(p[:, :2], (len(frames), len(p), 2))
-            poses = planar.both_poses(flat, xy, visible.astype(float))
-            poses[~(poses[..., 2, 3] > 0)] = np.nan  # behind the camera
-            path = tie.frames.path(fr.camera_frame(camera.name), fr.marker_frame(marker.name))
-            focal_px = float(np.mean(intrinsics[:2]))
-            off = np.where(visible[:, None], _off(poses, p, xy, focal_px), 0.0)
-            yield _View(path, frames, p, xy, visible, focal_px, poses, np.sum(off**2, axis=-1))
-
-
-def _off(T_camera_marker, p_marker, xy, focal_px):
-    """Capped distances of corners, px, for candidate poses (F, K, 4, 4) of points (m, 3): (F, K, m)."""
-    T = T_camera_marker
-    p = np.einsum("fkij,mj->fkmi", T[..., :3, :3], p_marker) + T[..., None, :3, 3]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        off = focal_px * np.hypot(*np.moveaxis(p[..., :2] / p[..., 2:] - xy[:, None], -1, 0))
-    off = np.where(p[..., 2] > 0, np.minimum(off, CORNER_CAP_PX), CORNER_CAP_PX)
-    return np.where(np.isnan(T[..., :1, 0]), np.nan, off)
-
-
-def _disagreement(candidates, misfit):
-    """How badly each candidate goes with the pictures of its epoch: its own by reprojection, the others by rotation.
-
-    Another picture chooses the branch that suits the candidate, at the price of that branch's own reprojection. So
-    uncertain mounts, which shift whole pictures by pixels, do not decide between branches; corners do.
-    """
-    n, k = misfit.shape
-    R = np.where(np.isfinite(candidates), candidates, np.eye(4))[..., :3, :3]
-    cosine = 0.5 * (np.einsum("naij,nbij->nab", R, R) - 1)
-    angle = np.arccos(np.clip(cosine, -1, 1))
-    own = 0.5 * misfit / OWN_SIGMA_PX**2
-    price = np.where(np.isnan(own)[:, None], np.inf, own[:, None] + 0.5 * (angle / AGREE_RAD) ** 2)
-    price = np.where(np.isnan(price), np.inf, price).reshape(n, k, k // 2, 2)
-    best = np.min(np.where(np.isnan(own), np.inf, own).reshape(n, k // 2, 2), axis=-1)[:, None]
-    total = np.minimum(price.min(axis=-1), best + DISAGREE_CAP)
-    for j in range(k):  # of its own picture a candidate is one branch and cannot choose
-        total[:, j, j // 2] = np.minimum(own[:, j], best[:, 0, j // 2] + DISAGREE_CAP)
-    return np.sum(np.where(np.isfinite(total), total, 0.0), axis=-1)  # inf: that picture is of another epoch
-
-
-def _score(candidates, views, around):
-    """Reprojection of every candidate in all pictures of its epoch: whitened cost, and the mean corner in px."""
-    total = np.zeros(candidates.shape[:2])
-    worst = np.zeros(candidates.shape[:2])
-    for view, (rows, before, after, step) in zip(views, around, strict=True):
-        E = candidates[rows]
-        if step.edge.ratio != 1.0:
-            E = fr.turn(step.edge.ratio * np.arctan2(E[..., 1, 0], E[..., 0, 0]))
-        T = before[:, None] @ (se3.inverse(E) if step.sign < 0 else E) @ after[:, None]
-        off = _off(T, view.p_marker, view.xy, view.focal_px)
-        total[rows] += np.sum(np.where(view.seen[:, None], off, 0.0) ** 2, axis=-1)
-        middle = np.sum(np.where(view.seen[:, None], off, 0.0), axis=-1) / view.seen.sum(-1)[:, None]
-        worst[rows] = np.maximum(worst[rows], middle)
-    bad = np.isnan(candidates[..., 0, 0])
-    return np.where(bad, np.inf, 0.5 * total / OTHER_SIGMA_PX**2), np.where(bad, np.inf, worst)
-
-
-def _viterbi(candidates, cost, time_s):
-    """The cheapest way through the candidates: reprojection, plus how far a body turns and moves in the time."""
-    best = np.min(cost, axis=1, keepdims=True)
-    with np.errstate(invalid="ignore"):
-        unary = np.where(np.isfinite(cost), np.minimum(cost - best, 10 * STEP_CAP), 1e6)
-    # What is no candidate is priced out above; as the identity it cannot overflow here.
-    rows = np.where(np.isfinite(candidates), candidates, np.eye(4))
-    n, k = candidates.shape[:2]
-    value, back = unary[0], np.zeros((n, k), dtype=np.int64)
-    if n > 1:
-        R, t = rows[..., :3, :3], rows[..., :3, 3]
-        cosine = 0.5 * (np.einsum("naij,nbij->nab", R[:-1], R[1:]) - 1)
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        shift = np.linalg.norm(t[1:, None] - t[:-1, :, None], axis=-1)
-        dt = np.diff(time_s)[:, None, None]
-        step = 0.5 * (angle / (TURN_RAD + TURN_RAD_S * dt)) ** 2
-        step += 0.5 * (shift / (SHIFT_M + SHIFT_M_S * dt)) ** 2
-        step = np.minimum(step, STEP_CAP)
-        for i in range(1, n):
-            total = value[:, None] + step[i - 1]
-            back[i] = total.argmin(axis=0)
-            value = total[back[i], np.arange(k)] + unary[i]
-    chosen = np.empty(n, dtype=np.int64)
-    chosen[-1] = value.argmin()
-    for i in range(n - 1, 0, -1):
-        chosen[i - 1] = back[i, chosen[i]]
-    return chosen
-
-
-def _medoid(candidates, cost):
-    """That candidate of one unchanging pose which lies closest to the others, by capped distance."""
-    flat, price = candidates.reshape(-1, 4, 4), cost.ravel()
-    order = np.argsort(price)[: min(400, int(np.sum(np.isfinite(price))))]
-    if len(order) == 0:
-        return np.eye(4)
-    T = flat[np.sort(order)]
-    shift = np.linalg.norm(T[:, None, :3, 3] - T[None, :, :3, 3], axis=-1)
-    turned = np.linalg.norm(so3.log(np.swapaxes(T[:, None, :3, :3], -1, -2) @ T[None, :, :3, :3]), axis=-1)
-    return T[np.argmin(np.sum(np.minimum(shift / 0.1 + turned / 0.05, 20.0), axis=1))]

@@ -49,10 +49,12 @@ def scale_of(inputs: ReportInputs, grid: Grid) -> float:
 
 
 def benchmarks_en(inputs: ReportInputs) -> dict[str, np.ndarray]:
-    """Benchmark -> easting and northing, grid metres."""
+    """Surveyed benchmark -> easting and northing, grid metres."""
     scale = inputs.site.grid.metres_per_unit
     found = {}
     for name, mark in inputs.site.benchmarks.items():
+        if not mark.is_surveyed:
+            continue
         enh = [mark.pose.enh] if mark.pose else [corner.enh for corner in mark.corners]
         found[name] = np.mean(np.array(enh, float), axis=0)[:2] * scale
     return found

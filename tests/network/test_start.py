@@ -6,9 +6,10 @@ import pytest
 
 from pipeline.geometry import se3, so3
 from pipeline.network import planar
+from pipeline.network.branches import viterbi
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
-from pipeline.network.start import _viterbi, geodesic, start
+from pipeline.network.start import geodesic, start
 from tests.estimation.simulator import Options, draw
 
 SQUARE = 0.15 * np.array([[-1.0, 1], [1, 1], [1, -1], [-1, -1]])
