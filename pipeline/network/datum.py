@@ -155,25 +155,38 @@ def _is_datum(network: Network, root: str) -> bool:
 
 
 def _anchors(network: Network, pairs: Counter) -> dict[str, str]:
-    """For each root body that can be tied: the frame its pose is kept in (for a static one, the world)."""
+    """For each root body that can be tied: the frame its pose is kept in (for a static one, the world).
+
+    A camera or marker of unknown mount is an end of its own, found once its body and what it shares pictures with are.
+    """
     roots = [n for n, b in network.bodies.items() if b.kind != "joint"]
     reached = {n for n in roots if _is_datum(network, n)}
     anchors = dict.fromkeys(reached, fr.WORLD)
     links = []
+    carriers: dict[str, str] = {}
     for (c, m), count in pairs.items():
         camera, marker = network.cameras[c], network.markers[m]
-        a, b = _root(network, camera.body), _root(network, marker.body)
+        a, b = _camera_end(network, camera), _marker_end(network, marker)
+        host_a, host_b = _root(network, camera.body), _root(network, marker.body)
         if a != b:
             links.append((count, a, b, camera, marker))
+        carriers |= {end: host for end, host in ((a, host_a), (b, host_b)) if end != host}
     links.sort(key=lambda link: (-link[0], link[3].name, link[4].name))
     while True:
         # The link with most observations first, so that a body is kept in the frame that sees it best.
-        found = next(((a, b, c, m) for _, a, b, c, m in links if (a in reached) != (b in reached)), None)
+        found = None
+        for _, a, b, camera, marker in links:
+            new = a if b in reached else b
+            if (a in reached) != (b in reached) and carriers.get(new, "world") in reached:
+                found = a, b, camera, marker
+                break
         if found is None:
             return anchors
         a, b, camera, marker = found
         new, other = (a, b) if b in reached else (b, a)
-        if network.bodies[new].kind == "static" or any(
+        if new in carriers:
+            anchors[new] = fr.body_frame(carriers[new])
+        elif network.bodies[new].kind == "static" or any(
             x == new and _is_datum(network, y) for _, x, y, _, _ in links
         ):
             anchors[new] = fr.WORLD
@@ -261,3 +274,23 @@ def _unseen(network: Network, pairs: Counter) -> list[str]:
         if k not in active:
             sentences.append(f"camera '{camera.name}' saw no known marker in the whole log")
     return sentences
+
+
+def _adrift(network: Network, pairs: Counter, anchors: dict[str, str]) -> list[str]:
+    """Sentences about cameras and markers of unknown mount that share no picture with anything that is tied."""
+    seen_cameras, seen_markers = {c for c, _ in pairs}, {m for _, m in pairs}
+    lost = [
+        ("camera", c.name)
+        for k, c in enumerate(network.cameras)
+        if k in seen_cameras and _camera_end(network, c) not in {*anchors, *network.bodies}
+    ]
+    lost += [
+        ("benchmark" if m.benchmark else "marker", m.name)
+        for k, m in enumerate(network.markers)
+        if k in seen_markers and _marker_end(network, m) not in {*anchors, *network.bodies}
+    ]
+    return [
+        f"the place of {kind} '{name}' is unknown, and it shares no picture with anything whose place is known: left "
+        "out of the adjustment"
+        for kind, name in lost
+    ]

@@ -7,29 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.errors import NetworkError
-from pipeline.geometry import camera as camera_model
-from pipeline.geometry import linkage, se3, so3
+from pipeline.geometry import linkage, se3
 from pipeline.network import frames as fr
-from pipeline.network import planar
+from pipeline.network.branches import disagreement, most_agreed, score, viterbi
 from pipeline.network.datum import Tie
 from pipeline.network.epochs import Epochs
 from pipeline.network.model import Network
+from pipeline.network.views import View, views_of
 
-CORNER_CAP_PX = 20.0
-"""A corner further off than this tells nothing about the branch, only that one of the two is wrong."""
-OWN_SIGMA_PX = 0.3
-"""A picture against its own pose: corner noise, and what uncertain intrinsics do."""
-OTHER_SIGMA_PX = 3.0
-"""A picture against the pose from another: a milliradian of an uncertain mount is a pixel and more. With one sigma for
-both, two cameras whose mounts were off by 0.05 deg agreed on a flipped marker."""
-AGREE_RAD, DISAGREE_CAP = 0.1, 50.0
-"""Two pictures of one body agree on its rotation to about this; a picture that cannot be brought to agree counts no
-more than the cap."""
-TURN_RAD, TURN_RAD_S = 0.05, 0.5
-SHIFT_M, SHIFT_M_S = 0.1, 2.0
-"""Between two pictures dt apart a body turns and moves by about the first plus the second times dt. The two branches
-of a marker differ by twice its tilt, as a rule tens of degrees."""
-STEP_CAP = 50.0
+BRIDGE_S = 0.5
+"""Between two of its pictures this close a body's place is good enough to tell other places from. Across longer gaps it
+is not: a tag first seen while the reference was out of view would start wherever the geodesic happened to pass."""
 LOST_PX = 5.0
 """A picture whose best pose leaves the median corner further off is no knot of the start."""
 

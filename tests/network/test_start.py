@@ -81,7 +81,7 @@ def test_the_path_of_least_turning_outlives_flips_of_a_quarter_of_the_pictures()
     cost = np.stack([np.zeros(n), np.full(n, 2.0)], axis=-1)
     wrong = rng.random(n) < 0.25  # here the flipped pose reprojects better
     cost[wrong] = cost[wrong][:, ::-1]
-    chosen = _viterbi(np.stack([right, flipped], axis=1), cost, t)
+    chosen = viterbi(np.stack([right, flipped], axis=1), cost, t)
     assert not chosen.any()
 
 
