@@ -1,0 +1,405 @@
+"""Change test in time: did a benchmark, a camera, a marker or a sensor move during the log, when, and how far?
+
+For a static ``s`` and an instant ``tau`` the alternative is one more unknown ``delta``, a step of that static from
+``tau`` on. Its score and its information, with all states and statics free, are those of one more column of the
+border that is zero before ``tau`` (Rao's test). With ``B_k`` the border, ``C(tau)`` the statics' own information from
+``tau`` on, and ``Z``, ``G``, ``Y``, ``S`` of the arrow, everything is a sum from the end of the log:
+
+    R_k = Z_k B_k - G_k R_k+1                     Q(tau) = sum over k >= tau of  B_k' R_k + R_k' B_k - B_k' Z_k B_k
+    N(tau) = C(tau) - sum of B_k' Y_k             I = C(tau) - Q(tau) - N(tau) S^-1 N(tau)'        (blocks of s)
+    g(tau) = sum of J' w r + B_k' dx_k + C_k dz   delta = -I^-1 g          T = g' I^-1 g
+
+so all statics and all instants together cost about as much as the marginals.
+
+Corner errors are not white: dirt on a print and the lens repeat from frame to frame (``table.REPEATED_PX``). So the
+scores of stretches of the log are held against what white noise would give, in batches of 1, 2, 4 ... stretches and
+after the step itself is taken out. ``T`` is divided, and the sigmas' squares are multiplied, by what is found, never by
+less than one.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+import scipy.linalg
+import scipy.stats
+from numba import njit
+
+from pipeline.estimation import arrow
+from pipeline.estimation.optimise import HOLD
+from pipeline.estimation.problem import Problem, Weights, huber, lengths, linearise, unchecked_statics
+from pipeline.estimation.residuals import corner_residuals, sensor_residuals
+from pipeline.estimation.values import Values
+from pipeline.network import frames as fr
+
+STRETCHES = 240
+"""At most so many candidate instants before one is found: two minutes of an 8 h shift."""
+STRETCH_S = 1.0
+"""No stretch is shorter: within it the errors of neighbouring frames are alike."""
+FEWEST = 16
+"""Stretches below which the scatter of the scores cannot be told, and so no change."""
+FALSE_ALARM = 1e-4
+"""Chance of naming a change in one static that has none, if the scatter is what was found: of thirty statics one in 300
+shifts. The bar is one in ten; the rest is for what the batches do not see."""
+WIDE = 40.0
+"""Whitened length beyond which a corner is a blunder here. The adjustment leaves out what is beyond 7.5, which is a
+benchmark that moved by 15 mm: gated like that, it would be silently lost instead of found."""
+INSTANT = 7.35
+"""How far T falls at the ends of the instant's 95 % interval: ``1 - (1 - exp(-x / 2))² = 0.05``, of a random walk that
+drifts away from its peak on both sides."""
+ALIKE = 0.01
+"""Statics whose T is within this share of the largest explain the log as well. Of two cameras on one body that see the
+same benchmarks only their turn against each other is known: 95,715.7 and 95,715.3."""
+SMALL_M, SMALL_RAD = 0.001, math.radians(0.01)
+"""Steps below both are not named: no print and no lens is known better, and nothing is done about them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """Scores and information of a step of every tested static (q unknowns in all) from each candidate instant on."""
+
+    at: np.ndarray
+    """(K,) rising epochs; the first is 0."""
+    rows: dict[int, np.ndarray]
+    """Per tested static: its places among the q."""
+    g: np.ndarray
+    """(K, q) efficient scores."""
+    own: np.ndarray
+    """(K, q, q) information of the steps once the states are eliminated; right in the blocks of one static."""
+    cross: np.ndarray
+    """(K, q, p) of the steps with the statics, once the states are eliminated."""
+    P_zz: np.ndarray
+    """(p, p)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """A step of one static."""
+
+    static: int
+    epoch: int
+    first: int
+    """Epochs between which it happened, with 95 %."""
+    last: int
+    step: np.ndarray
+    """(r,) in the static's whitened unknowns."""
+    cov: np.ndarray
+    """(r, r)."""
+    statistic: float
+    """T over the inflation."""
+    log_p: float
+    """Natural logarithm of the chance of such a T somewhere in the log without a change."""
+    inflation: float
+    """How much larger than white the scatter of the scores is."""
+
+
+def mounts_and_sensors(problem: Problem) -> set[int]:
+    """Statics that may change: poses of benchmarks, mounts of cameras and markers, curves and offsets of sensors."""
+    network, frames = problem.network, problem.tie.frames
+    hosts = {fr.camera_frame(c.name) for c in network.cameras} | {
+        fr.marker_frame(m.name) for m in network.markers
+    }
+    met = {
+        edge.index
+        for frame, edge in frames.edges.items()
+        if edge.kind == "static" and frame.split(" after ")[0] in hosts
+    }
+    for readings in problem.sensors:
+        met |= {readings.sensor.curve, readings.sensor.offset}
+    return met
+
+
+def testable(problem: Problem) -> list[int]:
+    """Those of them that are not exact in the files, and that more than one thing in the log speaks of."""
+    held = set(unchecked_statics(problem).tolist())
+    columns = problem.statics.columns
+    return [
+        s
+        for s in sorted(mounts_and_sensors(problem))
+        if len(columns[s]) and not held & set(columns[s].tolist())
+    ]
+
+
+def instants(problem: Problem, count: int = STRETCHES) -> np.ndarray:
+    """Candidate epochs, evenly over those of the log; the first is 0."""
+    t = problem.epochs.time_s
+    count = int(max(1, min(count, t[-1] / STRETCH_S, len(t))))
+    return np.unique(np.linspace(0, len(t), count, endpoint=False).astype(np.int64))
+
+
+def wide_weights(problem: Problem, values: Values, k: float) -> Weights:
+    """Huber's weights with only blunders left out."""
+    corners, sensors = [], []
+    with np.errstate(invalid="ignore"):
+        for group in problem.corners:
+            r, _ = corner_residuals(group, values, problem.statics, jacobians=False)
+            corners.append(lengths(r, 2) <= WIDE)
+        for readings in problem.sensors:
+            r, _ = sensor_residuals(readings, values, problem.statics, jacobians=False)
+            sensors.append(lengths(r, 1) <= WIDE)
+    return Weights(k, tuple(corners), tuple(sensors))
+
+
+def sums(problem: Problem, values: Values, weights: Weights, at) -> Sums:
+    """Scores and information for steps at the epochs ``at``; O(epochs)."""
+    p, K = problem.statics.size, len(at)
+    chains, C, g_z = linearise(problem, values, weights)
+    held = unchecked_statics(problem)
+    C[held, held] += HOLD
+    solved = arrow.solve(chains, C, g_z)
+    P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(solved.S), np.eye(p))
+    tested = testable(problem)
+    columns = [problem.statics.columns[s] for s in tested]
+    owner = np.repeat(tested, [len(c) for c in columns])
+    rows = {s: np.flatnonzero(owner == s) for s in tested}
+    place = np.full(p, -1)
+    place[np.concatenate([*columns, np.array([], dtype=np.int64)]).astype(np.int64)] = np.arange(len(owner))
+    g, info = _measured(problem, values, weights, at, place, len(owner))
+    own = _from_the_end(info[:, :, place >= 0][:, :, np.argsort(place[place >= 0])])
+    g += info @ solved.dz
+    bounds = [slice(a, b) for a, b in pairwise([*at.tolist(), len(problem.epochs.time_ns)])]
+    for chain, factored, Y, dx in zip(chains, solved.factors, arrow.border(solved), solved.dx, strict=True):
+        here = np.flatnonzero(place[chain.columns] >= 0)
+        to = place[chain.columns[here]]
+        B = np.ascontiguousarray(chain.B[:, :, here])
+        Z, G = arrow.selected_inverse(factored)
+        Q = np.zeros((K, len(here), len(here)))
+        _tails(Z, G, B, owner[to], at, Q)
+        own[np.ix_(np.arange(K), to, to)] -= Q
+        for j, part in enumerate(bounds):
+            B_j = B[part].reshape(-1, len(here))
+            info[np.ix_(np.array([j]), to, chain.columns)] -= (B_j.T @ Y[part].reshape(len(B_j), -1))[None]
+            g[j, to] += B_j.T @ dx[part].ravel()
+    return Sums(at, rows, _from_the_end(g), own, _from_the_end(info), P_zz)
+
+
+def _from_the_end(parts):
+    return np.cumsum(parts[::-1], axis=0)[::-1].copy()
+
+
+def _measured(problem: Problem, values: Values, weights: Weights, at, place, count: int):
+    """By stretch: gradient (K, q) of the tested statics and their information (K, q, p), with the states held."""
+    K, p = len(at), problem.statics.size
+    g, info = np.zeros((K, count)), np.zeros((K, count, p))
+
+    def add(epoch, r, J, group, alive, share):
+        if not J.statics:
+            return
+        weight = np.repeat(huber(lengths(r, group), weights.huber, alive)[0], group, axis=1)
+        use = weight > 0
+        weight = weight * share
+        z = np.concatenate([problem.statics.columns[s] for s in J.statics])
+        A = np.where(use[..., None], np.concatenate(list(J.statics.values()), axis=-1), 0.0)
+        r = np.where(use, r, 0.0)
+        here = np.flatnonzero(place[z] >= 0)
+        to = place[z[here]]
+        ends = np.searchsorted(epoch, [*at.tolist(), len(problem.epochs.time_ns)]).tolist()
+        for j, (a, b) in enumerate(pairwise(ends)):
+            if b > a:
+                A_j = A[a:b].reshape(-1, len(z))
+                wA = A_j[:, here] * weight[a:b].reshape(-1, 1)
+                info[np.ix_(np.array([j]), to, z)] += (wA.T @ A_j)[None]
+                g[j, to] += r[a:b].ravel() @ wA
+
+    for corners, alive in zip(problem.corners, weights.corners, strict=True):
+        r, J = corner_residuals(corners, values, problem.statics)
+        share = getattr(corners, "share", np.ones(len(r)))
+        add(corners.epoch, r, J, 2, alive, share[:, None])
+    for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
+        r, J = sensor_residuals(readings, values, problem.statics)
+        add(readings.epoch, r, J, 1, alive, 1.0)
+    return g, info
+
+
+@njit(cache=True, error_model="numpy")
+def _tails(Z, G, B, owner, at, out):
+    """``Q(tau)`` at each candidate, blocks of one static only, into out (K, q, q); owner: the static of a column."""
+    n, b, q = B.shape
+    R = np.zeros((b, q))
+    new = np.zeros((b, q))
+    total = np.zeros((q, q))
+    j = len(at) - 1
+    for k in range(n - 1, -1, -1):
+        for c in range(q):
+            for i in range(b):
+                s = 0.0
+                d = 0.0
+                for m in range(b):
+                    s += Z[k, i, m] * B[k, m, c]
+                    if k < n - 1:
+                        d += G[k, i, m] * R[m, c]
+                new[i, c] = s - 2.0 * d
+            # new is Z B - 2 G R: its product with B is the sum's symmetric part before it is made symmetric.
+        for c in range(q):
+            for e in range(q):
+                if owner[c] == owner[e]:
+                    s = 0.0
+                    for i in range(b):
+                        s += B[k, i, c] * new[i, e]
+                    total[c, e] += s
+        for c in range(q):
+            for i in range(b):
+                s = 0.0
+                for m in range(b):
+                    s += Z[k, i, m] * B[k, m, c]
+                R[i, c] = 0.5 * (new[i, c] + s)
+        while j >= 0 and at[j] == k:
+            for c in range(q):
+                for e in range(q):
+                    out[j, c, e] = 0.5 * (total[c, e] + total[e, c])
+            j -= 1
+
+
+def step_of(found: Sums, columns, j: int):
+    """Step of one static from candidate j on: (r,), its covariance under white noise (r, r), and T."""
+    ix = np.ix_(columns, columns)
+    N = found.cross[j][columns]
+    info = found.own[j][ix] - N @ found.P_zz @ N.T
+    values, vectors = np.linalg.eigh(0.5 * (info + info.T))
+    # A direction that this log does not tell (less than a hundredth of the file's own information, or lost in the
+    # rounding of what was taken off) stays out.
+    floor = max(1e-2, 1e-9 * float(np.trace(found.own[0][ix])))
+    inverse = np.where(values > floor, 1 / np.maximum(values, floor), 0.0)
+    cov = (vectors * inverse) @ vectors.T
+    g = found.g[j][columns]
+    return -cov @ g, cov, float(g @ cov @ g)
+
+
+def inflation(found: Sums, columns, j: int, step) -> float:
+    """Long-run variance of the scores over that of white noise, with a step from candidate j on taken out; at least 1.
+
+    Batches of 1, 2, 4 ... stretches, down to FEWEST of them; of each the mean over the directions, and the largest
+    direction over what so many white batches would show (Marchenko and Pastur's edge); the largest of all.
+    """
+    K, r = len(found.at), len(columns)
+    ix = np.ix_(np.arange(K), columns, columns)
+    own, cross, g = found.own[ix], found.cross[:, columns], found.g[:, columns]
+    V = own - np.concatenate([own[1:], np.zeros_like(own[:1])])
+    N = cross - np.concatenate([cross[1:], np.zeros_like(cross[:1])])
+    d = g - np.concatenate([g[1:], np.zeros_like(g[:1])])
+    after = (np.arange(K) >= j)[:, None]
+    d = d + after * (V @ step) - N @ (found.P_zz @ (cross[j].T @ step))
+    worst, size = 1.0, 1
+    while K // size >= FEWEST:
+        n = K // size
+        V_n = V[: n * size].reshape(n, size, r, r).sum(axis=1)
+        d_n = d[: n * size].reshape(n, size, r).sum(axis=1)
+        values, vectors = np.linalg.eigh(0.5 * (V_n + np.swapaxes(V_n, -1, -2)))
+        scale = np.where(values > 1e-6, 1 / np.sqrt(np.maximum(values, 1e-6)), 0.0)
+        white = np.einsum("nij,nj,nkj,nk->ni", vectors, scale, vectors, d_n, optimize=True)
+        live = n - np.sum(scale.max(axis=1) == 0)
+        if live < FEWEST:
+            break
+        spread = white.T @ white / (live - 2)
+        # One stretch that a blunder or a gap spoils must not hide a change: it counts at most four times the median.
+        length = np.sum(white**2, axis=1)
+        limit = 4 * max(float(np.median(length[length > 0])), r)
+        kept = np.minimum(1.0, limit / np.maximum(length, limit))
+        robust = (white * kept[:, None]).T @ white / (live - 2)
+        spread = spread if np.trace(spread) < 2 * np.trace(robust) else robust
+        edge = (1 + math.sqrt(r / live)) ** 2
+        worst = max(worst, float(np.trace(spread)) / r, float(np.linalg.eigvalsh(spread)[-1]) / edge)
+        size *= 2
+    return worst
+
+
+def log_chance(T: float, r: int, K: int) -> float:
+    """Logarithm of the chance that the largest of T over K instants of a log without a change is as large.
+
+    James, James and Siegmund's approximation to the maximum of the squared Brownian bridge over its variance in r
+    dimensions, between the first and the last instant.
+    """
+    if r + 2 >= T:
+        return 0.0
+    span = 2 * math.log(max(K - 1, 2))
+    density = (0.5 * r) * math.log(0.5 * T) - 0.5 * T - math.lgamma(0.5 * r)
+    return min(0.0, density + math.log((1 - r / T) * span + 2 / T))
+
+
+def strongest(problem: Problem, found: Sums) -> tuple[Change | None, tuple[int, ...]]:
+    """The change that is least by chance, if there is one, and the statics that explain it as well or nearly."""
+    K, best = len(found.at), None
+    if K < FEWEST:
+        return None, ()
+    peaks: dict[int, np.ndarray] = {}
+    for s in found.rows:
+        columns = found.rows[s]
+        T = np.array([0.0] + [step_of(found, columns, j)[2] for j in range(1, K)])
+        peaks[s] = T
+        j = int(np.argmax(T))
+        step, cov, _ = step_of(found, columns, j)
+        if is_small(problem, s, step):
+            continue
+        f = inflation(found, columns, j, step)
+        log_p = log_chance(T[j] / f, len(columns), K)
+        if log_p < math.log(FALSE_ALARM) and (best is None or log_p < best.log_p):
+            # T falls by INSTANT f where the instant leaves its 95 % interval.
+            near = np.flatnonzero(T[j] - T < INSTANT * f)
+            first, last = int(found.at[max(near[0] - 1, 0)]), int(found.at[min(near[-1] + 1, K - 1)])
+            best = Change(s, int(found.at[j]), first, last, step, f * cov, T[j] / f, log_p, f)
+    if best is None:
+        return None, ()
+    j = int(np.searchsorted(found.at, best.epoch))
+    bar = peaks[best.static][j] * (1 - ALIKE)
+    return best, tuple(s for s, T in peaks.items() if s != best.static and T[j] > bar)
+
+
+def is_small(problem: Problem, s: int, step) -> bool:
+    """Whether a step of a pose is below what is worth a sentence."""
+    if not problem.statics.is_pose[s]:
+        return False
+    xi = problem.statics.scale[s] @ step
+    return bool(np.linalg.norm(xi[:3]) < SMALL_M and np.linalg.norm(xi[3:]) < SMALL_RAD)
+
+
+def find(problem: Problem, values: Values, k: float) -> tuple[Change | None, tuple[int, ...]]:
+    """The strongest change of the log, its instant looked for twice: over all of it, then near the first answer.
+
+    Returns
+    -------
+    change : Change or None
+    others : tuple of int
+        Statics whose change would explain the log as well.
+    """
+    at = instants(problem)
+    if len(at) < FEWEST:
+        return None, ()
+    weights = wide_weights(problem, values, k)
+    change, others = strongest(problem, sums(problem, values, weights, at))
+    if change is None:
+        return None, ()
+    a, b = max(change.first, 1), min(change.last, len(problem.epochs.time_ns) - 1)
+    fine = np.unique(np.r_[0, np.linspace(a, b, min(STRETCHES, b - a + 1)).astype(np.int64)])
+    near = sums(problem, values, weights, fine)
+    columns = near.rows[change.static]
+    T = np.array([0.0] + [step_of(near, columns, j)[2] for j in range(1, len(fine))])
+    j = int(np.argmax(T))
+    step, cov, _ = step_of(near, columns, j)
+    inside = np.flatnonzero(T[j] - T < INSTANT * change.inflation)
+    better = replace(
+        change,
+        epoch=int(fine[j]),
+        first=int(fine[max(inside[0] - 1, 1)]),
+        last=int(fine[inside[-1]]),
+        step=step,
+        cov=change.inflation * cov,
+        statistic=float(T[j] / change.inflation),
+    )
+    return better, others
+
+
+def smallest(problem: Problem, found: Sums) -> dict[int, tuple[np.ndarray, float]]:
+    """Per static the covariance of a step in the middle of the log, (n, n) in its own units, and the inflation."""
+    out, j = {}, len(found.at) // 2
+    for s in found.rows:
+        columns = found.rows[s]
+        _, cov, _ = step_of(found, columns, j)
+        T = [step_of(found, columns, i)[2] for i in range(1, len(found.at))]
+        at = 1 + int(np.argmax(T))
+        f = inflation(found, columns, at, step_of(found, columns, at)[0])
+        scale = problem.statics.scale[s]
+        out[s] = (scale @ cov @ scale.T, f)
+    return out
