@@ -164,6 +164,37 @@ def check(log: Path, machine: Path | None, site: Path | None) -> None:
     click.echo(f"{log} is fit for a report: no error, {_plural(warnings, 'warning')}")
 
 
+@main.command()
+@click.argument("machine", metavar="MACHINE", type=click.Path(path_type=Path))
+@click.argument("site", metavar="SITE", type=click.Path(path_type=Path))
+@click.option(
+    "--log",
+    "run",
+    metavar="RUN",
+    type=click.Path(path_type=Path, file_okay=False),
+    help="Run folder of a log (runs/LOG): draw what was seen in it.",
+)
+@click.option(
+    "--out",
+    metavar="FILE",
+    type=click.Path(path_type=Path, dir_okay=False),
+    default=Path("network.svg"),
+    show_default=True,
+    help="Where the picture goes.",
+)
+def network(machine: Path, site: Path, run: Path | None, out: Path) -> None:
+    """Draw which camera sees which marker, what hangs on what, and say what is not tied to the datum.
+
+    MACHINE and SITE are machine.toml and site.toml. Without a log the picture shows what could be seen.
+    """
+    from pipeline.stages.network import draw, graph_of_files
+
+    graph = graph_of_files(machine, site, run)
+    for line in draw(graph, f"Network of {machine}" + (f", log {run.name}" if run else ""), out):
+        click.echo(line)
+    click.echo(f"drawn: {out}")
+
+
 @main.command("sample-logs", context_settings={"ignore_unknown_options": True}, add_help_option=False)
 @click.argument("arguments", nargs=-1, type=click.UNPROCESSED)
 def sample_logs(arguments: tuple[str, ...]) -> None:

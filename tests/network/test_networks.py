@@ -9,18 +9,21 @@ from tests.network.drawing import Course, Scene, draw
 CAB = Course([0.0, 0.0, 1.5], (0.03, 1.0))
 STICK = Course([1.0, 6.0, 0.3], (0.15, 6.0))
 BUCKET = Course(-15.0, (0.0, 12.0))
+ALWAYS = ((0.0, 1e9),)
+APART = {"bench>stick_board": ALWAYS, "dig>B1": ALWAYS, "dig>B2": ALWAYS, "dig>B3": ALWAYS}
+"""As in Fig. 4: one camera looks at the benchmarks, the other at the stick."""
 SCENES = [
     Scene("one-camera", {"cab": CAB}),
     Scene("site-camera", {"stick": STICK}),
     Scene("third-camera", {"cab": CAB, "stick": STICK}),
-    Scene("cluster", {"cab": CAB, "stick": STICK}),
+    Scene("cluster", {"cab": CAB, "stick": STICK}, hidden=APART),
     Scene("flip-marker", {"cab": CAB, "stick": STICK, "bucket": BUCKET}),
     Scene(
         "flip-marker",
         {"cab": CAB, "stick": STICK, "bucket": Course(50.0, (0.0, 20.0))},
         replaced=(("ratio = 1.0", "ratio = -0.5"),),
     ),
-    Scene("potentiometer", {"cab": CAB, "stick": STICK, "bucket": BUCKET}),
+    Scene("potentiometer", {"cab": CAB, "stick": STICK, "bucket": BUCKET}, hidden=APART),
     Scene(
         "full-chain",
         {
