@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import numpy as np
 
 from pipeline.config.site import EstimationSettings
 from pipeline.errors import EstimationError
-from pipeline.estimation import diagnostics
+from pipeline.estimation import diagnostics, observability
+from pipeline.estimation.budget import correlation_time, epoch_classes, vertical_budgets
+from pipeline.estimation.densities import described
 from pipeline.estimation.marginals import (
     BodyTrack,
     Marginals,
     body_track,
     common_part,
     marginals,
-    vertical_budget,
 )
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, problem_of
+from pipeline.estimation.repeated import SOURCE as CORNERS
+from pipeline.estimation.repeated import WHITE, Repeated, with_offsets
 from pipeline.estimation.solution import BodyStates, Solution
 from pipeline.estimation.values import Values, statics_of
+from pipeline.estimation.variances import settle
 from pipeline.network import frames as fr
 from pipeline.network.datum import tie as tie_network
 from pipeline.network.epochs import Epochs, epochs_of
-from pipeline.network.model import SOURCES, Network, Observations, Readings
+from pipeline.network.model import Network, Observations, Readings
 from pipeline.network.start import start as start_values
 
 LOST_SIGMAS = 10.0
@@ -34,6 +40,8 @@ def adjust(
     observations: Observations,
     readings: dict[str, Readings],
     settings: EstimationSettings | None = None,
+    repeated: Repeated = WHITE,
+    learn: bool = False,
 ) -> Solution:
     """Poses of every body at every epoch, and the statics, that fit everything best; with their covariances.
 
@@ -47,6 +55,10 @@ def adjust(
         By name of the sensor; a sensor that is missing here was not recorded.
     settings : EstimationSettings, optional
         Those of site.toml; without them the defaults.
+    repeated : Repeated
+        What of a corner's error comes back in the next picture; to start with, if ``learn``.
+    learn : bool
+        Learn that and the motion densities from the log; the given ones are the start.
 
     Returns
     -------
@@ -60,9 +72,10 @@ def adjust(
         The normal equations cannot be solved.
     """
     settings = settings or EstimationSettings()
+    network = with_offsets(network, observations, repeated)
     tied = tie_network(network, observations, readings)
     epochs = epochs_of(network, observations.take(tied.used), readings)
-    problem = problem_of_log(network, tied, epochs)
+    problem = problem_of_log(network, tied, epochs, repeated)
     optimum = optimise(problem, settings.huber, settings.max_iterations)
     if not optimum.converged and optimum.last_step_sigmas > LOST_SIGMAS:
         raise EstimationError(
@@ -70,14 +83,27 @@ def adjust(
             f"{optimum.last_step_sigmas:.2g} sigma; something in machine.toml or site.toml contradicts the log, "
             "most often the topic, field or curve of a sensor, or a tag's size or place"
         )
-    return solution_of(problem, optimum, settings)
+    if not learn or not optimum.converged:
+        return solution_of(problem, optimum, settings)
+    settled = settle(problem, optimum, settings, repeated)
+    solution = solution_of(settled.problem, settled.optimum, settings)
+    solution.diagnostics["learned"] = {
+        "rounds": settled.rounds,
+        "motion": described(settled.problem, list(settled.densities)),
+        "repeated": {
+            "constant": round(settled.repeated.constant, 4),
+            "resting": round(settled.repeated.resting, 4),
+        },
+    }
+    return solution
 
 
-def problem_of_log(network: Network, tied, epochs: Epochs) -> Problem:
+def problem_of_log(network: Network, tied, epochs: Epochs, repeated: Repeated = WHITE) -> Problem:
     """The least-squares problem of a log, with its start."""
     first = start_values(network, tied, epochs)
     statics = statics_of(network, tied, first)
-    return problem_of(network, tied, epochs, statics, Values(first.pose, first.rate, np.zeros(statics.size)))
+    values = Values(first.pose, first.rate, np.zeros(statics.size))
+    return problem_of(network, tied, epochs, statics, values, repeated)
 
 
 def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings) -> Solution:
@@ -87,6 +113,8 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
     seen, span = _coverage(problem, settings.max_gap_s)
     states = []
     budget: dict = {}
+    by_class: dict = {}
+    lasting: dict = {}
     for name in [*problem.network.bodies, fr.TOOL]:
         frame = fr.TOOL if name == fr.TOOL else fr.body_frame(name)
         if name == fr.WORLD or frame not in problem.tie.frames:
@@ -94,15 +122,20 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         track = body_track(problem, values, found, frame, name)
         rows, body_seen = _published(track, seen, span)
         if name == fr.TOOL:
-            budget = _budget(problem, found, track, rows[body_seen[rows]])
+            classes = epoch_classes(problem, values, track, body_seen)
+            budget, by_class = vertical_budgets(problem, found, track, rows, classes)
+            lasting = correlation_time(problem, found, track, rows, classes)
         states.append(_states(problem, values, found, track, rows, body_seen))
     corner_fits = diagnostics.fit_corners(problem, values, weights, found)
     sensor_fits = diagnostics.fit_sensors(problem, values, weights, found)
     table = diagnostics.corner_table(problem, corner_fits)
-    statics = diagnostics.static_results(problem, values, found)
+    # Constant errors of corners have no file to be compared with, and are many.
+    statics = [s for s in diagnostics.static_results(problem, values, found) if s.source != CORNERS]
     motion = diagnostics.motion_fit(problem, values)
+    untold = observability.findings(problem)
     warnings = [
         *problem.tie.warnings,
+        *(f.sentence for f in untold if f.kind in ("gauge", "line")),
         *diagnostics.moved_statics(statics),
         *diagnostics.stiff_motion(motion),
     ]
@@ -140,6 +173,9 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         "pixels": diagnostics.pixel_rms(problem.network, table),
         "dropped": problem.epochs.dropped,
         "error_budget": budget,
+        "error_budget_by_class": by_class,
+        "correlation_time_s": lasting,
+        "observability": [asdict(f) for f in untold],
         "warnings": warnings,
     }
     return Solution(tuple(states), tuple(statics), table, figures, tuple(warnings))
@@ -200,18 +236,3 @@ def _states(problem: Problem, values: Values, found: Marginals, track: BodyTrack
         track.own[rows],
         common_part(track, found.P_zz)[rows],
     )
-
-
-def _budget(problem: Problem, found: Marginals, track: BodyTrack, rows) -> dict:
-    """Median standard deviation of the elevation of the cutting edge's middle by source, m."""
-    if len(rows) == 0:
-        return {}
-    groups = {
-        source: np.concatenate(
-            [problem.statics.columns[k] for k, s in enumerate(problem.network.statics) if s.source == source]
-            or [np.array([], dtype=np.int64)]
-        )
-        for source in SOURCES
-    }
-    parts = vertical_budget(track, found.P_zz, groups, rows)
-    return {name: round(float(np.sqrt(np.median(variance))), 6) for name, variance in parts.items()}

@@ -44,7 +44,8 @@ def fit_corners(problem: Problem, values: Values, weights: Weights, found: Margi
         r, J = corner_residuals(group, values, problem.statics)
         assert J is not None
         weight = np.repeat(huber(lengths(r, 2), weights.huber, alive)[0], 2, axis=1)
-        fits.append(Fit(r, weight, _redundancy(problem, found, group.epoch, J, weight)))
+        kept = group.share[:, None] * weight
+        fits.append(Fit(r, weight, _redundancy(problem, found, group.epoch, J, kept)))
     return fits
 
 

@@ -27,6 +27,8 @@ class Marginals:
 
     Z: tuple[np.ndarray, ...]
     """(E, b, b) per chain: own part of its state."""
+    G: tuple[np.ndarray, ...]
+    """(E - 1, b, b) per chain; the own part of neighbouring states is ``Z_k,k+1 = -G_k Z_k+1``."""
     Y: tuple[np.ndarray, ...]
     """(E, b, q) per chain."""
     columns: tuple[np.ndarray, ...]
@@ -46,8 +48,9 @@ def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
             "the covariances of this log cannot be had: the normal equations are singular at the optimum; "
             "this happens when a sigma in machine.toml or site.toml is wrong by orders of magnitude"
         ) from None
-    Z = tuple(arrow.selected_inverse(f)[0] for f in step.factors)
-    return Marginals(Z, arrow.border(step), tuple(c.columns for c in chains), 0.5 * (P_zz + P_zz.T))
+    inverses = [arrow.selected_inverse(f) for f in step.factors]
+    Z, G = tuple(Z for Z, _ in inverses), tuple(G for _, G in inverses)
+    return Marginals(Z, G, arrow.border(step), tuple(c.columns for c in chains), 0.5 * (P_zz + P_zz.T))
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,6 +68,8 @@ class BodyTrack:
     """(E, 6, p) error by the statics' unknowns; the common part is ``M P_zz M'``."""
     variables: tuple[int, ...]
     """The variables between the world and this body."""
+    J_x: dict[int, np.ndarray]
+    """By chain: (E, 6, b) error by its states; the own part is the sum of ``J_x Z J_x'``."""
 
 
 def body_track(problem: Problem, values: Values, found: Marginals, frame: str, name: str) -> BodyTrack:
@@ -103,7 +108,7 @@ def body_track(problem: Problem, values: Values, found: Marginals, frame: str, n
         own += J_x @ found.Z[c] @ np.swapaxes(J_x, -1, -2)
         M[:, :, found.columns[c]] -= J_x @ found.Y[c]
     variables = tuple(s.edge.index for s in path if s.edge.kind != "static")
-    return BodyTrack(name, T, velocity, own, M, variables)
+    return BodyTrack(name, T, velocity, own, M, variables, J_chain)
 
 
 def common_part(track: BodyTrack, P_zz):

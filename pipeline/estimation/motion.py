@@ -103,12 +103,12 @@ def whiten(blocks, W, root):
         Unwhitened.
     W : (n, 2, 2) array
         Of ``whitening``.
-    root : (h,) array
-        Of ``root_density``.
+    root : (h,) or (n, h) array
+        Of ``root_density``, for all intervals or for each.
     """
-    h = len(root)
+    h = root.shape[-1]
     shape = (slice(None),) + (None,) * (blocks.ndim - 1)
-    scale = root.reshape((1, h) + (1,) * (blocks.ndim - 2))
+    scale = root.reshape((-1, h) + (1,) * (blocks.ndim - 2))
     first, second = blocks[:, :h] / scale, blocks[:, h:] / scale
     return np.concatenate(
         [W[:, 0, 0][shape] * first, W[:, 1, 0][shape] * first + W[:, 1, 1][shape] * second], axis=1

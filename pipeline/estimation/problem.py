@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.estimation import blocks, motion
 from pipeline.estimation.arrow import Chain
+from pipeline.estimation.repeated import WHITE, Repeated, information_share, offset_name, rests
 from pipeline.estimation.residuals import (
     Corners,
     Jacobians,
@@ -51,6 +52,8 @@ class Problem:
     """The start, about which the first epoch's weak prior stands."""
     dt_s: np.ndarray
     """(E - 1,)."""
+    roots: tuple[np.ndarray, ...]
+    """Per variable: (E - 1, h) square roots of the spectral densities between its epochs."""
 
     def place(self, variable: int) -> tuple[int, slice]:
         """The chain of a variable, and where its state stands in the chain's block."""
@@ -79,16 +82,27 @@ class Weights:
     """Per sensor: (n, 1) bool."""
 
 
-def problem_of(network: Network, tie: Tie, epochs: Epochs, statics: Statics, first: Values) -> Problem:
-    """Sort the observations into groups of one path each, and the variables into chains."""
+def problem_of(
+    network: Network, tie: Tie, epochs: Epochs, statics: Statics, first: Values, repeated: Repeated = WHITE
+) -> Problem:
+    """Sort the observations into groups of one path each, and the variables into chains.
+
+    Where corners have constant errors of their own, a group is one tag in one camera; else one marker in one camera.
+    """
     seen = epochs.observations
     marker_of = network.tag_marker[seen.tag]
+    named = {s.name: k for k, s in enumerate(network.statics)}
+    share = information_share(rests(seen), repeated)
     corners = []
     for c, camera in enumerate(network.cameras):
-        for m, marker in enumerate(network.markers):
-            rows = np.flatnonzero((seen.camera == c) & (marker_of == m))
-            if len(rows) == 0:
-                continue
+        of_camera = np.flatnonzero(seen.camera == c)
+        offsets = [named.get(offset_name(network, c, t)) for t in range(len(network.tag_marker))]
+        kind = np.array([len(offsets) + m if o is None else t
+                         for t, (o, m) in enumerate(zip(offsets, network.tag_marker, strict=True))])  # fmt: skip
+        for key in np.unique(kind[seen.tag[of_camera]]):
+            rows = of_camera[kind[seen.tag[of_camera]] == key]
+            m = int(marker_of[rows[0]])
+            marker = network.markers[m]
             rows = rows[np.argsort(epochs.epoch[rows], kind="stable")]
             path = tie.frames.path(fr.camera_frame(camera.name), fr.marker_frame(marker.name))
             corners.append(
@@ -102,6 +116,8 @@ def problem_of(network: Network, tie: Tie, epochs: Epochs, statics: Statics, fir
                     network.tag_corners[seen.tag[rows]],
                     seen.uv[rows],
                     np.linalg.inv(np.linalg.cholesky(seen.cov[rows])),
+                    share[rows],
+                    None if key >= len(offsets) else offsets[key],
                 )
             )
     sensors = []
@@ -125,6 +141,10 @@ def problem_of(network: Network, tie: Tie, epochs: Epochs, statics: Statics, fir
         _chains(len(tie.variables), corners),
         first,
         np.diff(epochs.time_s),
+        tuple(
+            np.tile(motion.root_density(v.kind, v.motion), (len(epochs.time_ns) - 1, 1))
+            for v in tie.variables
+        ),
     )
 
 
@@ -221,7 +241,8 @@ def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
     local = np.zeros(len(problem.epochs.time_ns))
     for group, alive in zip(problem.corners, weights.corners, strict=True):
         r, _ = corner_residuals(group, values, problem.statics, jacobians=False)
-        np.add.at(local, group.epoch, huber(lengths(r, 2), weights.huber, alive)[1].sum(axis=-1))
+        cost = huber(lengths(r, 2), weights.huber, alive)[1].sum(axis=-1)
+        np.add.at(local, group.epoch, group.share * cost)
     for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
         r, _ = sensor_residuals(readings, values, problem.statics, jacobians=False)
         np.add.at(local, readings.epoch, huber(lengths(r, 1), weights.huber, alive)[1].sum(axis=-1))
@@ -262,7 +283,7 @@ def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
     C, g_z = np.eye(p), values.z.copy()
     for group, alive in zip(problem.corners, weights.corners, strict=True):
         r, J = corner_residuals(group, values, problem.statics)
-        _add(problem, chains, C, g_z, group.epoch, r, J, 2, weights.huber, alive, newton)
+        _add(problem, chains, C, g_z, group.epoch, r, J, 2, weights.huber, alive, newton, group.share)
     for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
         r, J = sensor_residuals(readings, values, problem.statics)
         _add(problem, chains, C, g_z, readings.epoch, r, J, 1, weights.huber, alive, newton)
@@ -290,6 +311,8 @@ def _columns(problem: Problem, chain: int):
         if moving and moving[0] in problem.chains[chain]:
             met.update(s.edge.index for s in group.path if s.edge.kind == "static")
             met.add(group.intrinsics)
+            if group.offset is not None:
+                met.add(group.offset)
             met.update(c for k in moving if (c := problem.statics.clocks[k]) is not None)
     for readings in problem.sensors:
         if readings.variable in problem.chains[chain]:
@@ -304,9 +327,12 @@ def _columns(problem: Problem, chain: int):
 
 
 def _add(
-    problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, group: int, k: float, alive, newton
+    problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, group: int, k: float, alive, newton, share=None
 ) -> None:
-    """Add measurements, (n, m) whitened residuals at rising epochs, weighed in vectors of ``group`` components."""
+    """Add measurements, (n, m) whitened residuals at rising epochs, weighed in vectors of ``group`` components.
+
+    ``share`` (n,): what a measurement keeps of its information; robust weights follow from the residual as it is.
+    """
     length = lengths(r, group)
     weight, _ = huber(length, k, alive)
     use = np.repeat(weight > 0, group, axis=1)
@@ -322,6 +348,8 @@ def _add(
         unit = (r.reshape(n, -1, group) * along[..., None])[..., None]
         wA_v = wA.reshape(n, -1, group, A.shape[-1])
         wA = (wA_v - unit * np.sum(unit * wA_v, axis=2, keepdims=True)).reshape(A.shape)
+    if share is not None:
+        wA, wr = share[:, None, None] * wA, share[:, None] * wr
     z = np.concatenate([problem.statics.columns[s] for s in J.statics]) if J.statics else np.array([], int)
     count = A.shape[-1] - len(z)
     wAr = np.concatenate([wA, wr[..., None]], axis=-1)
@@ -349,7 +377,7 @@ def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):
     T, w, dt = values.pose[k], values.rate[k], problem.dt_s
     residual = motion.pose_residual if variable.kind == "moving" else motion.angle_residual
     e, J_1, J_2 = residual(T[:-1], w[:-1], T[1:], w[1:], dt, jacobians)
-    W, root = motion.whitening(dt), motion.root_density(variable.kind, variable.motion)
+    W, root = motion.whitening(dt), problem.roots[k]
     if not jacobians:
         return motion.whiten(e, W, root), None, None
     return motion.whiten(e, W, root), motion.whiten(J_1, W, root), motion.whiten(J_2, W, root)

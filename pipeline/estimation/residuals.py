@@ -38,6 +38,10 @@ class Corners:
     """(n, 4, 2)."""
     whitener: np.ndarray
     """(n, 4, 2, 2) lower triangular ``L^-1`` of the corner's covariance ``L L'``."""
+    share: np.ndarray
+    """(n,) how much of its information a sighting keeps, because its errors come back: see ``repeated.py``."""
+    offset: int | None = None
+    """Index of the static with the constant errors of the corners, px; the group is then of one tag."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,11 +78,12 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
     children, T = fr.along(corners.path, lambda edge: values.edge_pose(statics, edge, corners.epoch))
     p = np.einsum("...ij,...kj->...ki", T[..., :3, :3], corners.p_marker) + T[..., None, :3, 3]
     intrinsics = statics.value(corners.intrinsics, values.z)
+    constant = 0.0 if corners.offset is None else statics.value(corners.offset, values.z).reshape(4, 2)
     if not jacobians:
-        uv = camera_model.project(p, intrinsics)
+        uv = camera_model.project(p, intrinsics) + constant
         return np.einsum("nkij,nkj->nki", corners.whitener, corners.uv - uv).reshape(n, 8), None
     uv, J_uv_p, J_uv_intrinsics = camera_model.project_with_jacobians(p, intrinsics)
-    r = np.einsum("nkij,nkj->nki", corners.whitener, corners.uv - uv).reshape(n, 8)
+    r = np.einsum("nkij,nkj->nki", corners.whitener, corners.uv - uv - constant).reshape(n, 8)
     J_r_p = -(corners.whitener @ J_uv_p)
     by_variable: dict[int, np.ndarray] = {}
     by_static: dict[int, np.ndarray] = {}
@@ -111,6 +116,9 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
     if len(statics.columns[corners.intrinsics]):
         J = -(corners.whitener @ J_uv_intrinsics).reshape(n, 8, 9)
         by_static[corners.intrinsics] = J @ statics.sensitivity(corners.intrinsics, values.z)
+    if corners.offset is not None and len(statics.columns[corners.offset]):
+        S = statics.sensitivity(corners.offset, values.z).reshape(4, 2, -1)
+        by_static[corners.offset] = -(corners.whitener @ S).reshape(n, 8, -1)
     return r, Jacobians(by_variable, by_static)
 
 

@@ -7,6 +7,7 @@ import logging
 import time
 
 from pipeline.estimation import adjust
+from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.table import (
     columns_of_residuals,
     columns_of_states,
@@ -32,7 +33,7 @@ def run(job: Job, progress: Progress) -> Counts:
     readings = readings_of(job.read_table("sensors"))
     logger.info("adjusting %d tags and %d sensors", len(observations.camera), len(readings))
     progress.total(1)
-    solution = adjust(network, observations, readings, job.site.estimation)
+    solution = adjust(network, observations, readings, job.site.estimation, Repeated(), learn=True)
     with job.table_writer("states") as writer:
         for states in solution.states:
             writer.write(columns_of_states(states))

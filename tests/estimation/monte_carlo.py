@@ -9,6 +9,7 @@ import numpy as np
 import scipy.stats
 
 from pipeline.estimation import adjust
+from pipeline.estimation.repeated import WHITE, Repeated
 from pipeline.geometry import se3, so3
 from tests.estimation.simulator import MACHINE, SITE, Options, draw
 
@@ -25,9 +26,20 @@ class Sample:
     """(runs, 6) whitened error of the tool's pose."""
     statics: np.ndarray
     """(runs, p) z-scores of the statics' components."""
+    lenses: np.ndarray
+    """(runs, q) those of intrinsics alone."""
+    axes: np.ndarray
+    """(runs, 3) z-scores of the middle of the cutting edge along the axes of the grid."""
 
 
-def sample(runs: int, options: Options, trust_files: bool = False, seed: int = 1000) -> Sample:
+def sample(
+    runs: int,
+    options: Options,
+    trust_files: bool = False,
+    seed: int = 1000,
+    repeated: Repeated = WHITE,
+    learn: bool = False,
+) -> Sample:
     """Draw networks and adjust them.
 
     Parameters
@@ -40,8 +52,10 @@ def sample(runs: int, options: Options, trust_files: bool = False, seed: int = 1
         Adjust as if the files were exact, though the statics are drawn: the border of the normal matrix switched off.
     seed : int
         Of the first run.
+    repeated, learn
+        Of ``adjust``.
     """
-    edge, elevation, pose, statics = [], [], [], []
+    edge, elevation, pose, statics, lenses, axes = [], [], [], [], [], []
     for run in range(runs):
         drawn = draw(seed + run, options)
         network = drawn.network
@@ -50,7 +64,7 @@ def sample(runs: int, options: Options, trust_files: bool = False, seed: int = 1
                 network,
                 statics=tuple(replace(s, covariance=np.zeros_like(s.covariance)) for s in network.statics),
             )
-        solution = adjust(network, drawn.observations, drawn.readings)
+        solution = adjust(network, drawn.observations, drawn.readings, None, repeated, learn)
         tool = solution.body("tool")
         error, rows = drawn.error(tool)
         k = np.random.default_rng(run).integers(len(rows))
@@ -59,9 +73,11 @@ def sample(runs: int, options: Options, trust_files: bool = False, seed: int = 1
         R, C = T[:3, :3], P[:3, :3]
         edge.append(_whitened(xi[:3], C))
         elevation.append((R @ xi[:3])[2] / np.sqrt((R @ C @ R.T)[2, 2]))
+        axes.append((R @ xi[:3]) / np.sqrt(np.diagonal(R @ C @ R.T)))
         pose.append(_whitened(xi, P))
-        z = []
+        z, of_lenses = [], []
         for result, static, truth in zip(solution.statics, network.statics, drawn.statics, strict=True):
+            at = len(z)
             free = result.prior_sigma > 0
             if static.is_pose:
                 phi = result.file_value[3:]
@@ -71,8 +87,23 @@ def sample(runs: int, options: Options, trust_files: bool = False, seed: int = 1
             else:
                 value = truth
             z += list(((value - result.value) / np.where(free, result.sigma, 1.0))[free])
+            if static.source == "intrinsics":
+                of_lenses += z[at:]
         statics.append(z)
-    return Sample(np.array(edge), np.array(elevation), np.array(pose), np.array(statics))
+        lenses.append(of_lenses)
+    return Sample(
+        np.array(edge),
+        np.array(elevation),
+        np.array(pose),
+        np.array(statics),
+        np.array(lenses),
+        np.array(axes),
+    )
+
+
+def cover(z, factor: float = 1.96) -> float:
+    """Share of z-scores inside their 95 % interval."""
+    return float(np.mean(np.abs(z) < factor))
 
 
 def band(runs: int, dof: int) -> tuple[float, float]:

@@ -177,6 +177,10 @@ class Options:
     """Share of corners thrown off by 3 to 20 px."""
     blind: tuple[tuple[float, float], ...] = ()
     """Intervals, seconds, in which the benchmarks are out of view."""
+    constant: float = 0.0
+    """Share of a corner's variance that is the same in all pictures of its tag by a camera."""
+    resting: float = 0.0
+    """Share that is drawn anew only when the tag's picture has moved by a pixel."""
     machine: dict = field(default_factory=lambda: copy.deepcopy(MACHINE))
     site: dict = field(default_factory=lambda: copy.deepcopy(SITE))
 
@@ -296,6 +300,7 @@ def _look(rng, network, by_name, T_world, time_ns, frame_ns, o) -> Observations:
             marker = network.markers[m]
             name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
             T_camera_marker = se3.inverse(T_world_camera) @ _of(T_world, marker.body, rows) @ by_name[name]
+            kept: dict[str, np.ndarray] = {}
             for i, T in enumerate(T_camera_marker):
                 if marker.benchmark and blind[i]:
                     continue
@@ -308,7 +313,7 @@ def _look(rng, network, by_name, T_world, time_ns, frame_ns, o) -> Observations:
                 p = se3.transform(T, network.tag_corners[k])
                 if not inside or p[:, 2].min() < 0.5 or T[:3, 2] @ T[:3, 3] > -0.1 * np.linalg.norm(T[:3, 3]):
                     continue
-                uv = uv + SIGMA_PX * rng.standard_normal((4, 2))
+                uv = uv + SIGMA_PX * _noise(rng, uv, kept, o)
                 bad = rng.random(4) < o.outliers
                 away = rng.uniform(0, 2 * np.pi, 4)
                 uv += (bad * rng.uniform(3, 20, 4))[:, None] * np.stack([np.cos(away), np.sin(away)], axis=-1)
@@ -321,6 +326,19 @@ def _look(rng, network, by_name, T_world, time_ns, frame_ns, o) -> Observations:
         np.array([row[3] for row in out]).reshape(n, 4, 2),
         np.broadcast_to(SIGMA_PX**2 * np.eye(2), (n, 4, 2, 2)).copy(),
     )
+
+
+def _noise(rng, uv, kept, o):
+    """Standard normal errors of four corners; ``kept`` holds what comes back, and where its stay began."""
+    white = rng.standard_normal((4, 2))
+    if o.constant + o.resting == 0:
+        return white
+    if "constant" not in kept:
+        kept["constant"] = rng.standard_normal((4, 2))
+    if "uv" not in kept or np.linalg.norm(uv - kept["uv"], axis=1).max() > 1.0:
+        kept["uv"], kept["resting"] = uv, rng.standard_normal((4, 2))
+    parts = (o.constant, kept["constant"]), (o.resting, kept["resting"])
+    return np.sqrt(1 - o.constant - o.resting) * white + sum(np.sqrt(share) * e for share, e in parts)
 
 
 def picture(T_camera_marker, p_marker, intrinsics):

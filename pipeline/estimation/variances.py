@@ -1,0 +1,110 @@
+"""Variances that the log itself tells: motion densities and shares of errors that come back, settled with the states.
+
+Each round adjusts with the variances as they are, asks the residuals and smoothed increments what they should have
+been, and goes on from where it is; so a round after the first costs a few iterations and one covariance pass.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.config.site import EstimationSettings
+from pipeline.estimation import densities as motion_densities
+from pipeline.estimation import repeated as repeats
+from pipeline.estimation.densities import Densities
+from pipeline.estimation.marginals import marginals
+from pipeline.estimation.optimise import Optimum, optimise
+from pipeline.estimation.problem import Problem, huber, lengths
+from pipeline.estimation.repeated import Repeated
+from pipeline.estimation.residuals import corner_residuals
+from pipeline.estimation.values import Values
+
+ROUNDS = 3
+SETTLED = 1.25
+"""Ratio of densities from one round to the next below which nothing more is gained: a quarter of a density moves a
+smoothed sigma by 4 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """An optimum with the variances it belongs to."""
+
+    problem: Problem
+    optimum: Optimum
+    repeated: Repeated
+    densities: tuple[Densities, ...]
+    rounds: int
+
+
+def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, repeated: Repeated) -> Settled:
+    """Learn the variances, starting from an optimum with the configured ones.
+
+    What a round cannot do (an optimum that does not converge with the new variances) is not taken.
+    """
+    densities = motion_densities.configured(problem, optimum.values)
+    rounds = 0
+    for _ in range(ROUNDS):
+        found = marginals(problem, optimum.values, optimum.weights)
+        new = motion_densities.learned(problem, optimum.values, found, densities)
+        told = told_by(problem, optimum, settings.huber) if repeated.resting > 0 else None
+        moved = motion_densities.moved_by(densities, new)
+        if moved < SETTLED and rounds and (told is None or _near(told, repeated)):
+            densities = [
+                replace(old, measured=late.measured) for old, late in zip(densities, new, strict=True)
+            ]
+            break
+        trial = replace(
+            problem,
+            roots=tuple(d.roots(v.kind) for d, v in zip(new, problem.tie.variables, strict=True)),
+            first=optimum.values,
+        )
+        if told is not None:
+            trial = with_repeated(trial, repeated, told)
+        tried = optimise(trial, settings.huber, settings.max_iterations)
+        if not tried.converged:
+            break
+        problem, optimum, densities, repeated = trial, tried, new, told or repeated
+        rounds += 1
+    return Settled(problem, optimum, repeated, tuple(densities), rounds)
+
+
+def told_by(problem: Problem, optimum: Optimum, k: float) -> Repeated | None:
+    """Shares of what comes back, by the residuals of all corners."""
+    residuals, use, tracks, rows = [], [], [], []
+    without = replace(optimum.values, z=optimum.values.z.copy())
+    for group in problem.corners:
+        if group.offset is not None:
+            without.z[problem.statics.columns[group.offset]] = 0.0
+    seen = problem.epochs.observations
+    for group, alive in zip(problem.corners, optimum.weights.corners, strict=True):
+        r, _ = corner_residuals(group, without, problem.statics, jacobians=False)
+        weight, _ = huber(lengths(r, 2), k, alive)
+        residuals.append(np.nan_to_num(r))
+        use.append(np.repeat(weight == 1, 2, axis=1))
+        tracks.append(seen.camera[group.rows] * len(problem.network.tag_id) + seen.tag[group.rows])
+        rows.append(group.rows)
+    if not rows:
+        return None
+    stay = repeats.rests(seen)[np.concatenate(rows)]
+    return repeats.measured(np.concatenate(residuals), np.concatenate(tracks), stay, np.concatenate(use))
+
+
+def with_repeated(problem: Problem, old: Repeated, new: Repeated) -> Problem:
+    """The same problem with other shares: offsets keep their values, their priors and all information changes."""
+    share = repeats.information_share(repeats.rests(problem.epochs.observations), new)
+    corners = tuple(replace(g, share=share[g.rows]) for g in problem.corners)
+    factor = np.sqrt(new.constant / old.constant)
+    scale, z = list(problem.statics.scale), problem.first.z.copy()
+    for k, static in enumerate(problem.network.statics):
+        if static.source == repeats.SOURCE:
+            scale[k] = factor * scale[k]
+            z[problem.statics.columns[k]] /= factor
+    statics = replace(problem.statics, scale=tuple(scale))
+    first = Values(problem.first.pose, problem.first.rate, z)
+    return replace(problem, corners=corners, statics=statics, first=first)
+
+
+def _near(a: Repeated, b: Repeated) -> bool:
+    return max(abs(np.log(a.constant / b.constant)), abs(np.log(a.resting / b.resting))) < np.log(SETTLED)
