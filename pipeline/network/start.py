@@ -13,6 +13,7 @@ from pipeline.network.branches import disagreement, most_agreed, score, viterbi
 from pipeline.network.datum import Tie
 from pipeline.network.epochs import Epochs
 from pipeline.network.model import Network
+from pipeline.network.resection import refined
 from pipeline.network.views import View, views_of
 
 BRIDGE_S = 0.5
@@ -71,6 +72,8 @@ class _Search:
         self.unknown += [
             ("static", k) for k, s in enumerate(network.statics) if not s.surveyed and k in hanging
         ]
+        # Where places grow on each other, the error of single pictures would too; else the adjustment corrects it.
+        self.grows = any(kind == "static" for kind, _ in self.unknown)
         self.known = np.zeros(
             (len(tie.variables), n), dtype=bool
         )  # at these epochs, from pictures or readings
@@ -168,7 +171,7 @@ class _Search:
         rows_of = [np.searchsorted(knots, v.epoch) for v in views]
         pictures = np.zeros(
             len(knots), dtype=np.int64
-        )  # so far, of each knot: few of many markers are in one frame
+        )  # so far, at each knot: few of many markers are in one frame
         width = 2 * int(np.bincount(np.concatenate(rows_of)).max())
         candidates = np.full((len(knots), width, 4, 4), np.nan)
         misfit = np.full((len(knots), width), np.nan)
@@ -188,14 +191,21 @@ class _Search:
         cost, middle_px = score(candidates, views, around)
         cost += disagreement(candidates, misfit)
         if key[0] == "static":
-            self.statics[key[1]] = most_agreed(candidates, misfit, cost)
+            every = [(np.zeros_like(rows), *rest) for rows, *rest in around]
+            found = most_agreed(candidates, misfit, cost)[None]
+            self.statics[key[1]] = refined(found, views, every)[0]
         else:
             chosen = viterbi(candidates, cost, self.time_s[knots])
             rows = np.arange(len(knots))
-            good = np.isfinite(cost[rows, chosen]) & (middle_px[rows, chosen] < LOST_PX)
+            found = np.isfinite(cost[rows, chosen])
+            E, middle_px = candidates[rows, chosen], middle_px[rows, chosen]
+            if self.grows and key[0] == "moving":
+                E = refined(np.where(found[:, None, None], E, np.eye(4)), views, around)
+                middle_px = score(E[:, None], views, around)[1][:, 0]
+            good = found & (middle_px < LOST_PX)
             if np.sum(good) < 0.5 * len(knots):
-                good = np.isfinite(cost[rows, chosen])
-            E = candidates[rows, chosen][good]
+                good = found
+            E = E[good]
             self.asked[key[1]][knots] = True
             if len(E):
                 self._interpolate(key, self.time_s[knots[good]], E)

@@ -8,7 +8,7 @@ picture of the same focal length, each with the covariance that makes a pixel th
 import csv
 import json
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -53,6 +53,13 @@ class Recording:
     T_rig_camera: list
     rig_ns: np.ndarray
     T_world_rig: np.ndarray
+
+    def with_cameras(self, count):
+        """The same recording, of the first few cameras only."""
+        rows = self.camera < count
+        of_rows = {k: getattr(self, k)[rows] for k in ("camera", "tag", "time_ns", "uv")}
+        lists = {k: getattr(self, k)[:count] for k in ("cameras", "intrinsics", "fisheye", "T_rig_camera")}
+        return replace(self, **of_rows, **lists)
 
 
 def recording(folder) -> Recording:
@@ -224,15 +231,17 @@ def rms(off):
     return float(np.sqrt(np.mean(np.square(off))))
 
 
-@pytest.mark.parametrize("name", list(SIGMA_PX))
-def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data, name):
+@pytest.mark.parametrize(
+    ("name", "cameras"), [("test_1", 1), ("test_2", 2), ("test_21", 4), ("test_21", 2)], ids=str
+)
+def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data, name, cameras):
     """Within 5 mm and 0.5 deg, or within three of our sigmas where the log holds a tag no better than that.
 
     That is so on the upper flight of test_21's stairs: 35 to 50 pictures of three tags tie it to the lower one, and its
-    tags are 6 to 22 mm off. The other solver had an inertial odometry there, which the recording does not carry, and took
-    cameras 9 ms apart as one.
+    tags are 6 to 22 mm off. The other solver had inertial odometry there, which the recording does not carry, and took
+    cameras 9 ms apart as one. Its two fisheyes alone, which tick together, lead to the same answer.
     """
-    rec = recording(real_data / "tag_corners" / name)
+    rec = recording(real_data / "tag_corners" / name).with_cameras(cameras)
     network, observations, keep = network_and_observations(rec)
     solution = adjust(network, observations, {})
     assert solution.diagnostics["converged"]
