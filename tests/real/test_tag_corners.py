@@ -24,8 +24,9 @@ pytestmark = pytest.mark.real
 OURS_IN_THEIRS = [3, 2, 1, 0]
 SIGMA_PX = {"test_1": 0.4, "test_2": 0.3, "test_21": 0.2}
 """What the corners of each recording scatter by."""
-LINE_MM, LINE_DEG, GOOD_PX = 5.0, 0.5, 0.5
-"""Tags whose reprojection through the other answer is below the last agree with it to the first two."""
+LINE_MM, LINE_DEG = 5.0, 0.5
+BEYOND = {"test_21": (8, (5, 6, 7, 9, 15, 19, 25))}
+"""A tag of the upper flight of stairs, and the others there: 35 to 50 pictures of three tie them to the lower one."""
 WIDEST_RAD = np.deg2rad(75.0)
 """Beyond, a pixel of the recording is fifteen of the pinhole picture along the radius."""
 PAIRED_NS = 25_000_000
@@ -235,11 +236,12 @@ def rms(off):
     ("name", "cameras"), [("test_1", 1), ("test_2", 2), ("test_21", 4), ("test_21", 2)], ids=str
 )
 def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data, name, cameras):
-    """Within 5 mm and 0.5 deg, or within three of our sigmas where the log holds a tag no better than that.
+    """Within 5 mm and 0.5 deg, after fixing the same tag; on test_21's stairs one tag in each flight.
 
-    That is so on the upper flight of test_21's stairs: 35 to 50 pictures of three tags tie it to the lower one, and its
-    tags are 6 to 22 mm off. The other solver had inertial odometry there, which the recording does not carry, and took
-    cameras 9 ms apart as one. Its two fisheyes alone, which tick together, lead to the same answer.
+    From the lower flight, all of the upper one is turned by 0.6 to 1 deg, 6 to 22 mm, which our sigma of 0.5 deg foretells:
+    the other solver had inertial odometry there, which the recording does not carry, and took cameras 9 ms apart as one.
+    Where it puts them the corners lie worse, by plain least squares too; the two fisheyes alone, which tick together, lead
+    to the same answer as all four cameras.
     """
     rec = recording(real_data / "tag_corners" / name).with_cameras(cameras)
     network, observations, keep = network_and_observations(rec)
@@ -260,22 +262,25 @@ def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data
     )
     assert np.mean(both) > 0.7
     assert rms(ours[both]) <= rms(theirs[both])
-    held = 0
+    pivot, others = BEYOND.get(name, (None, ()))
     for tag in sorted(set(rec.sizes) - {rec.fixed}):
-        rows = both & (rec.tag == tag)
-        off = se3.local(rec.T_world_tag[tag], T_world_tag[tag])
+        fixed = pivot if tag in others else rec.fixed
+        off = se3.local(
+            se3.inverse(rec.T_world_tag[fixed]) @ rec.T_world_tag[tag],
+            se3.inverse(T_world_tag[fixed]) @ T_world_tag[tag],
+        )
         mm, deg = 1000 * np.linalg.norm(off[:3]), np.rad2deg(np.linalg.norm(off[3:]))
         sigma_mm = 1000 * np.linalg.norm(tags[tag].sigma[:3])
         sigma_deg = np.rad2deg(np.linalg.norm(tags[tag].sigma[3:]))
+        rows = both & (rec.tag == tag)
         print(
-            f"  tag {tag:3d}: {mm:5.2f} mm (sigma {sigma_mm:5.2f}), {deg:5.3f} deg ({sigma_deg:5.3f}); "
-            f"RMS {rms(ours[rows]):.3f} px, theirs {rms(theirs[rows]):.3f}, {np.sum(rows)} pictures"
+            f"  tag {tag:3d} by {fixed:3d}: {mm:5.2f} mm, {deg:5.3f} deg (sigma by {rec.fixed}: {sigma_mm:5.2f}, "
+            f"{sigma_deg:5.3f}); RMS {rms(ours[rows]):.3f} px, theirs {rms(theirs[rows]):.3f}, {np.sum(rows)} pictures"
         )
-        if rms(theirs[rows]) < GOOD_PX:
-            assert mm < max(LINE_MM, 3 * sigma_mm) and deg < max(LINE_DEG, 3 * sigma_deg), tag
-            held += mm < LINE_MM and deg < LINE_DEG
-    print(f"  {held} tags within {LINE_MM:g} mm and {LINE_DEG:g} deg")
-    assert held >= {"test_1": 1, "test_2": 6, "test_21": 14}[name]
+        if tag == pivot:
+            assert mm < 3 * sigma_mm and deg < 3 * sigma_deg, tag
+        else:
+            assert mm < LINE_MM and deg < LINE_DEG, tag
 
 
 def _of_table(result):
