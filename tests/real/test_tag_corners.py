@@ -238,10 +238,10 @@ def rms(off):
 def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data, name, cameras):
     """Within 5 mm and 0.5 deg, after fixing the same tag; on test_21's stairs one tag in each flight.
 
-    From the lower flight, all of the upper one is turned by 0.6 to 1 deg, 6 to 22 mm, which our sigma of 0.5 deg foretells:
-    the other solver had inertial odometry there, which the recording does not carry, and took cameras 9 ms apart as one.
-    Where it puts them the corners lie worse, by plain least squares too; the two fisheyes alone, which tick together, lead
-    to the same answer as all four cameras.
+    From the lower flight, all of the upper one is turned by 0.6 to 1 deg, 6 to 22 mm, which our sigma of 0.5 deg
+    foretells: the other solver had inertial odometry there, which the recording does not carry, and took cameras 9
+    ms apart as one. Where it puts them the corners lie worse, by plain least squares too; the two fisheyes alone,
+    which tick together, lead to the same answer as all four cameras.
     """
     rec = recording(real_data / "tag_corners" / name).with_cameras(cameras)
     network, observations, keep = network_and_observations(rec)
