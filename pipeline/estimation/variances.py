@@ -22,6 +22,8 @@ from pipeline.estimation.residuals import corner_residuals
 from pipeline.estimation.values import Values
 
 ROUNDS = 3
+ROUND_STEPS = 2
+"""Iterations within a round: other variances move the states by a share of a sigma, which one step finds."""
 SETTLED = 1.25
 """Ratio of densities from one round to the next below which nothing more is gained: a quarter of a density moves a
 smoothed sigma by 4 %."""
@@ -41,33 +43,34 @@ class Settled:
 def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, repeated: Repeated) -> Settled:
     """Learn the variances, starting from an optimum with the configured ones.
 
-    What a round cannot do (an optimum that does not converge with the new variances) is not taken.
+    If the adjustment does not converge with what was learned, that optimum comes back as it was.
     """
-    densities = motion_densities.configured(problem, optimum.values)
-    rounds = 0
+    densities = start = motion_densities.configured(problem, optimum.values)
+    trial, at, shares, rounds = problem, optimum, repeated, 0
     for _ in range(ROUNDS):
-        found = marginals(problem, optimum.values, optimum.weights)
-        new = motion_densities.learned(problem, optimum.values, found, densities)
-        told = told_by(problem, optimum, settings.huber) if repeated.resting > 0 else None
+        found = marginals(trial, at.values, at.weights)
+        new = motion_densities.learned(trial, at.values, found, densities)
+        told = told_by(trial, at, settings.huber) if repeated.resting > 0 else None
         moved = motion_densities.moved_by(densities, new)
-        if moved < SETTLED and rounds and (told is None or _near(told, repeated)):
-            densities = [
-                replace(old, measured=late.measured) for old, late in zip(densities, new, strict=True)
-            ]
-            break
         trial = replace(
-            problem,
+            trial,
             roots=tuple(d.roots(v.kind) for d, v in zip(new, problem.tie.variables, strict=True)),
-            first=optimum.values,
+            first=at.values,
         )
-        if told is not None:
-            trial = with_repeated(trial, repeated, told)
-        tried = optimise(trial, settings.huber, settings.max_iterations)
-        if not tried.converged:
-            break
-        problem, optimum, densities, repeated = trial, tried, new, told or repeated
+        densities = new
         rounds += 1
-    return Settled(problem, optimum, repeated, tuple(densities), rounds)
+        if told is not None:
+            near = _near(told, shares)
+            trial, shares = with_repeated(trial, shares, told), told
+        else:
+            near = True
+        if (moved < SETTLED and near) or rounds == ROUNDS:
+            break
+        at = optimise(trial, settings.huber, ROUND_STEPS)
+    at = optimise(trial, settings.huber, settings.max_iterations)
+    if not at.converged:
+        return Settled(problem, optimum, repeated, tuple(start), 0)
+    return Settled(trial, at, shares, tuple(densities), rounds)
 
 
 def told_by(problem: Problem, optimum: Optimum, k: float) -> Repeated | None:
