@@ -43,13 +43,13 @@ class Factor:
     def forward(self, rhs):
         """``U^-T rhs``: (E, b, r) from (E, b, r)."""
         out = np.ascontiguousarray(rhs).copy()
-        blocks.forward(self.U, self.F, out)
+        blocks.forward(self.U, self.F, out, len(self.U))
         return out
 
     def backward(self, rhs):
         """``U^-1 rhs``: (E, b, r) from (E, b, r)."""
         out = np.ascontiguousarray(rhs).copy()
-        blocks.backward(self.U, self.F, out)
+        blocks.backward(self.U, self.F, out, len(self.U))
         return out
 
 
@@ -74,7 +74,7 @@ def factor(D, A, damping=None) -> Factor:
     if damping is not None:
         i = np.arange(D.shape[-1])
         U[:, i, i] *= 1 + damping[:, None]
-    bad = blocks.factor(U, F)
+    bad = blocks.factor(U, F, len(U))
     if bad >= 0:
         raise np.linalg.LinAlgError(f"block {bad} is not positive definite")
     return Factor(U, F)
@@ -90,7 +90,7 @@ def selected_inverse(factored: Factor):
         Neighbouring blocks follow as ``Z_k,k+1 = -G_k Z_k+1``.
     """
     Z, G = np.empty_like(factored.U), np.empty_like(factored.F)
-    blocks.selected_inverse(factored.U, factored.F, Z, G)
+    blocks.selected_inverse(factored.U, factored.F, Z, G, len(Z))
     return Z, G
 
 

@@ -12,11 +12,12 @@ import numpy as np
 from numba import njit
 
 
-@njit(cache=True, error_model="numpy")
-def factor(D, A):
+@njit(cache=True, error_model="numpy", nogil=True)
+def factor(D, A, count):
     """Cholesky factor in place: ``D_k`` becomes ``U_k`` (upper triangle), ``A_k`` becomes ``F_k = U_k^-T A_k``.
 
-    Returns the number of the first block that is not positive definite, or -1.
+    Only the first ``count`` blocks are eliminated; one after them is left as ``D_k - F_k-1' F_k-1``. Returns the number
+    of the first block that is not positive definite, or -1.
     """
     n, b, _ = D.shape
     for k in range(n):
@@ -28,6 +29,8 @@ def factor(D, A):
                     f = F[m, i]
                     for j in range(b):
                         U[i, j] -= f * F[m, j]
+        if k == count:
+            break
         for i in range(b):
             pivot = U[i, i]
             if not pivot > 0.0:
@@ -55,9 +58,9 @@ def factor(D, A):
     return -1
 
 
-@njit(cache=True, error_model="numpy")
-def forward(U, F, B):
-    """``W_k = U_k^-T (B_k - F_k-1' W_k-1)``, in place of B (n, b, r)."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def forward(U, F, B, count):
+    """``W_k = U_k^-T (B_k - F_k-1' W_k-1)``, in place of B (n, b, r); the block after ``count`` without ``U_k^-T``."""
     n, b, r = B.shape
     for k in range(n):
         W = B[k]
@@ -67,6 +70,8 @@ def forward(U, F, B):
                     f = F[k - 1, m, i]
                     for j in range(r):
                         W[i, j] -= f * B[k - 1, m, j]
+        if k == count:
+            break
         for i in range(b):
             for m in range(i):
                 f = U[k, m, i]
@@ -77,11 +82,11 @@ def forward(U, F, B):
                 W[i, j] *= f
 
 
-@njit(cache=True, error_model="numpy")
-def backward(U, F, W):
-    """``Y_k = U_k^-1 (W_k - F_k Y_k+1)``, in place of W (n, b, r)."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def backward(U, F, W, count):
+    """``Y_k = U_k^-1 (W_k - F_k Y_k+1)``, in place of W (n, b, r); a block after ``count`` is given as it is."""
     n, b, r = W.shape
-    for k in range(n - 1, -1, -1):
+    for k in range(count - 1, -1, -1):
         Y = W[k]
         if k < n - 1:
             for i in range(b):
@@ -99,13 +104,16 @@ def backward(U, F, W):
                 Y[i, j] *= f
 
 
-@njit(cache=True, error_model="numpy")
-def selected_inverse(U, F, Z, G):
-    """``G_k = U_k^-1 F_k`` and ``Z_k = U_k^-1 U_k^-T + G_k Z_k+1 G_k'``, into Z (n, b, b) and G (n - 1, b, b)."""
+@njit(cache=True, error_model="numpy", nogil=True)
+def selected_inverse(U, F, Z, G, count):
+    """``G_k = U_k^-1 F_k`` and ``Z_k = U_k^-1 U_k^-T + G_k Z_k+1 G_k'``, into Z (n, b, b) and G (n - 1, b, b).
+
+    A block of Z after ``count`` is given.
+    """
     n, b, _ = U.shape
     V = np.zeros((b, b))
     T = np.zeros((b, b))
-    for k in range(n - 1, -1, -1):
+    for k in range(count - 1, -1, -1):
         V[:] = 0.0  # U_k^-1
         for i in range(b - 1, -1, -1):
             V[i, i] = 1.0
@@ -146,7 +154,7 @@ def selected_inverse(U, F, Z, G):
                 Z[k, i, j] = Z[k, j, i]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def gram(A, B):
     """``A' B`` of two tall matrices (n, p), (n, q) whose product is known to be symmetric in its first p columns."""
     n, p = A.shape

@@ -29,8 +29,9 @@ import scipy.stats
 from numba import njit
 
 from pipeline.estimation import arrow
+from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import HOLD
-from pipeline.estimation.problem import Problem, Weights, huber, lengths, linearise, unchecked_statics
+from pipeline.estimation.problem import Problem, Weights, huber, lengths, unchecked_statics
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.estimation.values import Values
 from pipeline.network import frames as fr

@@ -8,14 +8,17 @@ the linear map ``J_x dx + J_s dz`` of both, and ``dx = own - Y dz``. So its comm
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import arrow
-from pipeline.estimation.problem import Problem, Weights, linearise
+from pipeline.estimation import sweeps
+from pipeline.estimation.optimise import parts, pieces
+from pipeline.estimation.parts import Part
+from pipeline.estimation.problem import Problem, Weights
 from pipeline.estimation.values import Values
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
@@ -37,20 +40,48 @@ class Marginals:
     """(p, p) covariance of the statics' unknowns; their prior is the identity."""
 
 
-def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
-    """Covariances at the optimum, without any damping."""
-    chains, C, g_z = linearise(problem, values, weights)
+def marginals_by_part(problem: Problem, values: Values, weights: Weights) -> Iterator[tuple[Part, Marginals]]:
+    """Covariances at the optimum, without any damping, from the last part of the log to the first.
+
+    Those of the states are of the part's epochs and of its far end.
+    """
+    cut = parts(problem, values, weights)
+    linearised = pieces(cut)
     try:
-        step = arrow.solve(chains, C, g_z)
-        P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(step.S), np.eye(len(C))) if len(C) else C
+        reduced = sweeps.reduce(linearised, len(cut))
+        S = reduced.S
+        P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S))) if len(S) else S
     except np.linalg.LinAlgError:
         raise EstimationError(
             "the covariances of this log cannot be had: the normal equations are singular at the optimum; "
             "this happens when a sigma in machine.toml or site.toml is wrong by orders of magnitude"
         ) from None
-    inverses = [arrow.selected_inverse(f) for f in step.factors]
-    Z, G = tuple(Z for Z, _ in inverses), tuple(G for _, G in inverses)
-    return Marginals(Z, G, arrow.border(step), tuple(c.columns for c in chains), 0.5 * (P_zz + P_zz.T))
+    P_zz = 0.5 * (P_zz + P_zz.T)
+    columns = tuple(c.columns for c in linearised(len(cut) - 1).chains)
+    for i, found in sweeps.inverses(linearised, reduced):
+        yield (
+            cut[i],
+            Marginals(
+                tuple(f.Z for f in found),
+                tuple(f.G for f in found),
+                tuple(f.Y for f in found),
+                columns,
+                P_zz,
+            ),
+        )
+
+
+def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
+    """Covariances of a whole log in memory: 2 GB for 100,000 epochs of two bodies."""
+    found = [(part, m) for part, m in marginals_by_part(problem, values, weights)][::-1]
+    chains = range(len(problem.chains))
+    return Marginals(
+        tuple(np.concatenate([m.Z[c][: part.epochs] for part, m in found]) for c in chains),
+        tuple(np.concatenate([m.G[c] for _, m in found]) for c in chains),
+        tuple(np.concatenate([m.Y[c][: part.epochs] for part, m in found]) for c in chains),
+        found[0][1].columns,
+        found[0][1].P_zz,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pipeline.estimation import arrow
-from pipeline.estimation.problem import Problem, keep_all, linearise
+from pipeline.estimation.normal import linearise
+from pipeline.estimation.problem import Problem, keep_all
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.estimation.values import Values
 from pipeline.network import frames as fr

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import arrow
-from pipeline.estimation.problem import (
-    Problem,
-    Weights,
-    cost_by_epoch,
-    keep_all,
-    lengths,
-    linearise,
-    unchecked_statics,
-)
-from pipeline.estimation.residuals import corner_residuals, sensor_residuals
+from pipeline.estimation import sweeps
+from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise
+from pipeline.estimation.parts import Part, bounds, part_of
+from pipeline.estimation.problem import Problem, Weights, keep_all, lengths, unchecked_statics
+from pipeline.estimation.residuals import sensor_residuals
 from pipeline.estimation.values import Values
 
 STRETCH = 64
@@ -37,6 +32,7 @@ GATE = 3.0
 becomes zero, and the rest is adjusted again. Gated from the start, a bad start would throw away good corners."""
 GATE_ROUNDS = 4
 TRIES = 14
+KEPT_PARTS = 4
 HOLD = 1e12
 """Information that keeps an unchecked static where it is during the steps; a prior is 1. Not for covariances."""
 
@@ -80,35 +76,53 @@ def optimise(problem: Problem, huber: float, max_iterations: int) -> Optimum:
 def gate(problem: Problem, values: Values, weights: Weights) -> Weights:
     """Weights that leave out what is a gross outlier at these values."""
     limit = GATE * weights.huber
-    corners = []
-    for group in problem.corners:
-        with np.errstate(invalid="ignore"):
-            corners.append(
-                lengths(corner_residuals(group, values, problem.statics, jacobians=False)[0], 2) <= limit
-            )
-    sensors = []
-    for readings in problem.sensors:
-        with np.errstate(invalid="ignore"):
-            sensors.append(
-                lengths(sensor_residuals(readings, values, problem.statics, jacobians=False)[0], 1) <= limit
-            )
-    return replace(weights, corners=tuple(corners), sensors=tuple(sensors))
+    corners: list[list[np.ndarray]] = [[] for _ in problem.corners]
+    sensors: list[list[np.ndarray]] = [[] for _ in problem.sensors]
+    for part in parts(problem, values, weights):
+        for rows, group in zip(corners, part.problem.corners, strict=True):
+            rows.append(corner_lengths(part.problem, part.values, group) <= limit)
+        for rows, readings in zip(sensors, part.problem.sensors, strict=True):
+            r, _ = sensor_residuals(readings, part.values, problem.statics, jacobians=False)
+            with np.errstate(invalid="ignore"):
+                rows.append(lengths(r, 1) <= limit)
+    return replace(
+        weights,
+        corners=tuple(map(np.concatenate, corners)),
+        sensors=tuple(map(np.concatenate, sensors)),
+    )
 
 
-def deltas_of(problem: Problem, dx) -> list[np.ndarray]:
-    """Chain steps, cut up by variable."""
-    out = []
-    for k in range(len(problem.tie.variables)):
-        c, at = problem.place(k)
-        out.append(dx[c][:, at])
-    return out
+def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
+    """All parts of a log, in order."""
+    return [part_of(problem, values, weights, a, b) for a, b in bounds(problem)]
+
+
+def pieces(
+    cut: list[Part], newton=False, finish: Callable[[int, sweeps.Piece], sweeps.Piece] | None = None
+) -> sweeps.Pieces:
+    """Normal equations of the parts, when they are asked for.
+
+    The last few stay: sweep two begins where sweep one ends, and a short log is linearised once.
+    """
+    kept: dict[int, sweeps.Piece] = {}
+
+    def piece(i: int) -> sweeps.Piece:
+        if i not in kept:
+            part = cut[i]
+            chains, C, g_z = linearise(part.problem, part.values, part.weights, newton)
+            while len(kept) >= KEPT_PARTS:
+                kept.pop(next(iter(kept)))
+            kept[i] = sweeps.Piece(tuple(chains), C, g_z, part.epochs)
+        return finish(i, kept[i]) if finish else kept[i]
+
+    return piece
 
 
 def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
     damping = np.zeros(stretch[-1] + 1)
-    local, prior = cost_by_epoch(problem, values, weights)
+    local, prior = _cost(problem, values, weights)
     if not np.isfinite(local.sum()):
         raise EstimationError(
             "the starting values of the adjustment cannot be evaluated; look at the detections of the first "
@@ -118,16 +132,13 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
     sigmas, converged, used = np.inf, False, 0
     while used < limit and not converged:
         used += 1
-        chains, C, g_z = linearise(problem, values, weights, newton=used > IRLS_STEPS)
-        C[held, held] += HOLD
+        step = _Step(problem, values, weights, held, newton=used > IRLS_STEPS)
         shorten = 1.0
         for attempt in range(TRIES):
-            step = _solve(chains, C, g_z, damping[stretch])
-            decrease = -sum(float(np.sum(c.g * d)) for c, d in zip(chains, step.dx, strict=True)) - float(
-                g_z @ step.dz
-            )
-            trial = values.retract(deltas_of(problem, [shorten * d for d in step.dx]), shorten * step.dz)
-            trial_local, trial_prior = cost_by_epoch(problem, trial, weights)
+            step.solve(damping[stretch])
+            decrease = step.decrease
+            trial = step.taken(shorten)
+            trial_local, trial_prior = _cost(problem, trial, weights)
             change = trial_local.sum() + trial_prior - local.sum() - prior
             rise = np.bincount(stretch, trial_local - local)
             # Rounding of the sum, and what re-weighting may cost, are no reason to damp.
@@ -153,14 +164,71 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
     return values, used, converged, sigmas, local.sum() + prior
 
 
-def _solve(chains, C, g_z, damping):
-    """The step; where rounding leaves the matrix indefinite, everything is damped a little."""
-    for extra in (0.0, 1e-9, 1e-6, 1e-3):
-        try:
-            return arrow.solve(chains, C, g_z, damping + extra)
-        except np.linalg.LinAlgError:
-            continue
-    raise EstimationError(
-        "the normal equations of this log cannot be solved: measurements contradict each other beyond what the "
-        "stated sigmas allow, or a sigma in machine.toml or site.toml is wrong by orders of magnitude"
-    )
+def deltas_of(problem: Problem, dx) -> list[np.ndarray]:
+    """Chain steps, cut up by variable."""
+    places = [problem.place(k) for k in range(len(problem.tie.variables))]
+    return [dx[c][:, at] for c, at in places]
+
+
+class _Step:
+    """The Gauss-Newton step at one point, solved for as often as the damping changes."""
+
+    def __init__(self, problem: Problem, values: Values, weights: Weights, held, newton: bool):
+        self.problem, self.values = problem, values
+        self.cut = cut = parts(problem, values, weights)
+        self.damping = damping = np.zeros(len(problem.epochs.time_ns))
+
+        def finish(i: int, piece: sweeps.Piece) -> sweeps.Piece:
+            # Knows nothing of self: in a cycle with it, the parts of every step so far would wait for the collector.
+            C = piece.C
+            if i == 0 and len(held):
+                C = C.copy()
+                C[held, held] += HOLD
+            return replace(piece, C=C, damping=damping[cut[i].with_far_end])
+
+        self.pieces = pieces(cut, newton, finish)
+
+    def solve(self, damping) -> None:
+        """Solve; where rounding leaves the matrix indefinite, everything is damped a little."""
+        for extra in (0.0, 1e-9, 1e-6, 1e-3):
+            self.damping[:] = damping + extra
+            try:
+                reduced = sweeps.reduce(self.pieces, len(self.cut))
+            except np.linalg.LinAlgError:
+                continue
+            break
+        else:
+            raise EstimationError(
+                "the normal equations of this log cannot be solved: measurements contradict each other beyond what "
+                "the stated sigmas allow, or a sigma in machine.toml or site.toml is wrong by orders of magnitude"
+            )
+        self.dz, self.decrease = reduced.dz, reduced.decrease
+        E = len(self.problem.epochs.time_ns)
+        self.deltas = [np.empty((E, v.size)) for v in self.problem.tie.variables]
+        for i, dx in sweeps.steps(self.pieces, reduced):
+            part = self.cut[i]
+            for delta, of_part in zip(self.deltas, deltas_of(self.problem, dx), strict=True):
+                delta[part.start : part.stop] = of_part[: part.epochs]
+
+    def taken(self, shorten: float) -> Values:
+        """The values after a share of the step."""
+        moved = [
+            part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
+            for part in self.cut
+        ]
+        return replace(
+            self.values,
+            pose=tuple(np.concatenate(T) for T in zip(*(v.pose for v in moved), strict=True)),
+            rate=tuple(np.concatenate(w) for w in zip(*(v.rate for v in moved), strict=True)),
+            z=self.values.z + shorten * self.dz,
+        )
+
+
+def _cost(problem: Problem, values: Values, weights: Weights):
+    """``cost_by_epoch`` of the whole log, part by part."""
+    local, prior = np.zeros(len(problem.epochs.time_ns)), 0.0
+    for part in parts(problem, values, weights):
+        of_part, of_statics = cost_by_epoch(part.problem, part.values, part.weights)
+        local[part.start : part.stop] = of_part[: part.epochs]
+        prior += of_statics
+    return local, prior

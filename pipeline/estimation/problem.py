@@ -1,4 +1,4 @@
-"""The whole least-squares problem of one log, and its linearisation as an arrow.
+"""The whole least-squares problem of one log: its measurements, sorted, and what each of them costs.
 
 Variables that share an observation form one chain; chains are independent of each other given the statics, and so
 separate, smaller block-tridiagonal systems: two of 12 cost a quarter of one of 24.
@@ -10,17 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.estimation import blocks, motion
-from pipeline.estimation.arrow import Chain
+from pipeline.estimation import motion
 from pipeline.estimation.repeated import WHITE, Repeated, information_share, offset_name, rests
-from pipeline.estimation.residuals import (
-    Corners,
-    Jacobians,
-    SensorReadings,
-    corner_residuals,
-    measured_sigma,
-    sensor_residuals,
-)
+from pipeline.estimation.residuals import Corners, SensorReadings, measured_sigma
 from pipeline.estimation.values import Statics, Values
 from pipeline.geometry import so3
 from pipeline.network import frames as fr
@@ -54,6 +46,9 @@ class Problem:
     """(E - 1,)."""
     roots: tuple[np.ndarray, ...]
     """Per variable: (E - 1, h) square roots of the spectral densities between its epochs."""
+
+    opens: bool = True
+    """Whether it begins where the log begins: there the first epoch's weak prior and those of the statics count."""
 
     def place(self, variable: int) -> tuple[int, slice]:
         """The chain of a variable, and where its state stands in the chain's block."""
@@ -227,148 +222,6 @@ def huber(length, k: float, alive):
 def lengths(r, group: int):
     """Lengths of the whitened residuals of each corner (group = 2) or reading (group = 1): (n, m / group)."""
     return np.linalg.norm(r.reshape(len(r), -1, group), axis=-1)
-
-
-def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
-    """Robust cost at every epoch, and that of the statics' priors.
-
-    Returns
-    -------
-    local : (E,) array
-        Corners and readings of the epoch, motion up to the next, and at the first epoch its weak prior.
-    prior : float
-    """
-    local = np.zeros(len(problem.epochs.time_ns))
-    for group, alive in zip(problem.corners, weights.corners, strict=True):
-        r, _ = corner_residuals(group, values, problem.statics, jacobians=False)
-        cost = huber(lengths(r, 2), weights.huber, alive)[1].sum(axis=-1)
-        np.add.at(local, group.epoch, group.share * cost)
-    for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
-        r, _ = sensor_residuals(readings, values, problem.statics, jacobians=False)
-        np.add.at(local, readings.epoch, huber(lengths(r, 1), weights.huber, alive)[1].sum(axis=-1))
-    for k in range(len(problem.tie.variables)):
-        e, _, _ = motion_residual(problem, values, k, jacobians=False)
-        local[:-1] += 0.5 * np.sum(e**2, axis=-1)
-        local[0] += 0.5 * np.sum(first_residual(problem, values, k)[0] ** 2)
-    return local, 0.5 * float(values.z @ values.z)
-
-
-def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
-    """Normal equations at the given values, after re-weighting.
-
-    Parameters
-    ----------
-    problem : Problem
-        All measurements.
-    values : Values
-        Where to linearise.
-    weights : Weights
-        What counts; the robust weights follow from the residuals at ``values``.
-    newton : bool
-        Take the curvature of Huber's loss as it is: beyond the threshold there is none along the residual. For steps
-        only; re-weighting alone converges linearly, 40 iterations where this takes 10. Never for covariances.
-
-    Returns
-    -------
-    chains : list of Chain
-    C : (p, p) array
-    g_z : (p,) array
-    """
-    E, p = len(problem.epochs.time_ns), problem.statics.size
-    columns = [_columns(problem, c) for c in range(len(problem.chains))]
-    chains = [
-        Chain(np.zeros((E, b, b)), np.zeros((E - 1, b, b)), np.zeros((E, b)), np.zeros((E, b, len(q))), q)
-        for b, q in zip(map(problem.chain_size, range(len(columns))), columns, strict=True)
-    ]
-    C, g_z = np.eye(p), values.z.copy()
-    for group, alive in zip(problem.corners, weights.corners, strict=True):
-        r, J = corner_residuals(group, values, problem.statics)
-        _add(problem, chains, C, g_z, group.epoch, r, J, 2, weights.huber, alive, newton, group.share)
-    for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
-        r, J = sensor_residuals(readings, values, problem.statics)
-        _add(problem, chains, C, g_z, readings.epoch, r, J, 1, weights.huber, alive, newton)
-    for k in range(len(problem.tie.variables)):
-        c, at = problem.place(k)
-        chain = chains[c]
-        e, J_1, J_2 = motion_residual(problem, values, k)
-        J_1t, J_2t = np.swapaxes(J_1, -1, -2), np.swapaxes(J_2, -1, -2)
-        chain.D[:-1, at, at] += J_1t @ J_1
-        chain.D[1:, at, at] += J_2t @ J_2
-        chain.A[:, at, at] += J_1t @ J_2
-        chain.g[:-1, at] += np.einsum("nij,nj->ni", J_1t, e)
-        chain.g[1:, at] += np.einsum("nij,nj->ni", J_2t, e)
-        e, J = first_residual(problem, values, k)
-        chain.D[0, at, at] += J.T @ J
-        chain.g[0, at] += J.T @ e
-    return chains, C, g_z
-
-
-def _columns(problem: Problem, chain: int):
-    """Statics that bear on a chain."""
-    met: set[int] = set()
-    for group in problem.corners:
-        moving = [s.edge.index for s in group.path if s.edge.kind != "static"]
-        if moving and moving[0] in problem.chains[chain]:
-            met.update(s.edge.index for s in group.path if s.edge.kind == "static")
-            met.add(group.intrinsics)
-            if group.offset is not None:
-                met.add(group.offset)
-            met.update(c for k in moving if (c := problem.statics.clocks[k]) is not None)
-    for readings in problem.sensors:
-        if readings.variable in problem.chains[chain]:
-            sensor = readings.sensor
-            clock = problem.statics.clocks[readings.variable]
-            assert clock is not None
-            met.update({sensor.curve, sensor.offset, clock})
-            if sensor.linkage is not None:
-                met.add(sensor.linkage)
-    parts = [problem.statics.columns[s] for s in sorted(met)]
-    return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
-
-
-def _add(
-    problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, group: int, k: float, alive, newton, share=None
-) -> None:
-    """Add measurements, (n, m) whitened residuals at rising epochs, weighed in vectors of ``group`` components.
-
-    ``share`` (n,): what a measurement keeps of its information; robust weights follow from the residual as it is.
-    """
-    length = lengths(r, group)
-    weight, _ = huber(length, k, alive)
-    use = np.repeat(weight > 0, group, axis=1)
-    r = np.where(use, r, 0.0)
-    n, m = r.shape
-    parts = [*J.variables.values(), *J.statics.values()]
-    A = np.where(use[..., None], np.concatenate(parts, axis=-1), 0.0)
-    wA = np.repeat(weight, group, axis=1)[..., None] * A
-    wr = np.repeat(weight, group, axis=1) * r
-    if newton:
-        # Past the threshold the loss is a cone: it bends across the residual, not along it.
-        along = np.where((weight > 0) & (weight < 1), 1 / np.maximum(length, k), 0.0)
-        unit = (r.reshape(n, -1, group) * along[..., None])[..., None]
-        wA_v = wA.reshape(n, -1, group, A.shape[-1])
-        wA = (wA_v - unit * np.sum(unit * wA_v, axis=2, keepdims=True)).reshape(A.shape)
-    if share is not None:
-        wA, wr = share[:, None, None] * wA, share[:, None] * wr
-    z = np.concatenate([problem.statics.columns[s] for s in J.statics]) if J.statics else np.array([], int)
-    count = A.shape[-1] - len(z)
-    wAr = np.concatenate([wA, wr[..., None]], axis=-1)
-    square = blocks.gram(A.reshape(n * m, -1)[:, count:], wAr.reshape(n * m, -1)[:, count:])
-    C[np.ix_(z, z)] += square[:, :-1]
-    g_z[z] += square[:, -1]
-    if not J.variables:
-        return
-    places = {v: problem.place(v) for v in J.variables}
-    chain = chains[next(iter(places.values()))[0]]
-    x = np.concatenate([np.arange(at.start, at.stop) for _, at in places.values()])
-    A_xt = np.swapaxes(A[..., :count], -1, -2)
-    starts = np.flatnonzero(np.r_[True, np.diff(epoch) > 0])
-    at = epoch[starts]
-    both = np.add.reduceat(A_xt @ wAr, starts, axis=0)
-    chain.D[np.ix_(at, x, x)] += both[..., :count]
-    chain.g[np.ix_(at, x)] += both[..., -1]
-    if len(z):
-        chain.B[np.ix_(at, x, np.searchsorted(chain.columns, z))] += both[..., count:-1]
 
 
 def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):

@@ -10,8 +10,9 @@ import scipy.linalg
 
 from pipeline.errors import EstimationError
 from pipeline.estimation import arrow, changes
+from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import Optimum, optimise
-from pipeline.estimation.problem import Problem, linearise
+from pipeline.estimation.problem import Problem
 from pipeline.estimation.residuals import Corners, SensorReadings
 from pipeline.estimation.values import Statics, Values
 from pipeline.geometry import se3

@@ -283,10 +283,10 @@ def _blocks_from_rotation(T):
 # one, X sum o_k X^2k, becomes c1 X + c3 X³: c1 = sum o_k (1 - k) (-s)^k, c3 = sum_k>=1 o_k k (-s)^(k-1).
 _C2_SINC, _C4_SINC = (so3.SINC * (2 - _K))[1:], (so3.SINC * (_K - 1))[2:]
 _C1_VERSINE, _C3_VERSINE = so3.VERSINE * (1 - _K), (so3.VERSINE * _K)[1:]
-_C2_COT, _C4_COT = (so3.COT * (2 - _K))[1:], (so3.COT * (_K - 1))[2:]
+C2_COT, C4_COT = (so3.COT * (2 - _K))[1:], (so3.COT * (_K - 1))[2:]
 # d/ds of sum a_k (-s)^k is sum -(k + 1) a_(k+1) (-s)^k.
-_DC2_COT, _DC4_COT = (-_K[: len(c)] * c for c in (_C2_COT, _C4_COT))
-_DC2_COT, _DC4_COT = _DC2_COT[1:], _DC4_COT[1:]
+DC2_COT, DC4_COT = (-_K[: len(c)] * c for c in (C2_COT, C4_COT))
+DC2_COT, DC4_COT = DC2_COT[1:], DC4_COT[1:]
 
 
 def _even_coefficients(s):
@@ -332,7 +332,7 @@ def _inverse_coefficients(s):
         f, df, _ = _cot_and_slopes(s, theta)
         return ((1 - f) / s + df) / s
 
-    return so3.series_or_closed_form(s, _C2_COT, c2), so3.series_or_closed_form(s, _C4_COT, c4)
+    return so3.series_or_closed_form(s, C2_COT, c2), so3.series_or_closed_form(s, C4_COT, c4)
 
 
 def _inverse_coefficient_slopes(s):
@@ -346,4 +346,4 @@ def _inverse_coefficient_slopes(s):
         f, df, ddf = _cot_and_slopes(s, theta)
         return -2 * (1 - f) / s**3 - 2 * df / s**2 + ddf / s
 
-    return so3.series_or_closed_form(s, _DC2_COT, dc2), so3.series_or_closed_form(s, _DC4_COT, dc4)
+    return so3.series_or_closed_form(s, DC2_COT, dc2), so3.series_or_closed_form(s, DC4_COT, dc4)

@@ -11,8 +11,9 @@ from pipeline.errors import NetworkError
 from pipeline.estimation import adjust
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.marginals import body_track, common_part, marginals
+from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import optimise
-from pipeline.estimation.problem import first_residual, keep_all, linearise, motion_residual
+from pipeline.estimation.problem import first_residual, keep_all, motion_residual
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.geometry import se3
 from pipeline.network import Readings

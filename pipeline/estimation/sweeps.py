@@ -1,0 +1,189 @@
+"""The arrow in two sweeps, one part of the log at a time.
+
+Sweep one runs forward and keeps of each part only the message at its end: the normal equations of that epoch with
+everything before it eliminated. Sweep two runs backwards and asks for each part again. So memory does not grow with
+the log, and 288,000 epochs take a third less time than in one piece, because blocks stay in the caches. ``arrow`` does
+the same in one piece, and is the oracle of the tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+
+from pipeline.estimation import blocks
+from pipeline.estimation.arrow import Chain
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """Normal equations of one part of the log.
+
+    Its chains hold the part's own epochs, and after them (but for the last part) one that the part shares with
+    the next: what this part says of it.
+    """
+
+    chains: tuple[Chain, ...]
+    """Independent of each other given the statics."""
+    C: np.ndarray
+    """(p, p) information of the statics with the states held fixed."""
+    g_z: np.ndarray
+    """(p,) gradient."""
+    count: int
+    """The part's own epochs."""
+    damping: np.ndarray | None = None
+    """(E,) share of each epoch's own diagonal that is added to it; never in the covariance pass."""
+
+
+Pieces = Callable[[int], Piece]
+"""The normal equations of the part of a number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """What everything before an epoch says of its state, one chain."""
+
+    D: np.ndarray
+    """(b, b)."""
+    W: np.ndarray
+    """(b, q + 1) border, and the right-hand side."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reduced:
+    """What sweep one leaves: the statics' own system, and the messages between the parts."""
+
+    S: np.ndarray
+    """(p, p) information of the statics once the states are eliminated; its inverse is their covariance."""
+    dz: np.ndarray
+    """(p,) their step."""
+    decrease: float
+    """``-g' dx``, the squared length of the whole step in posterior sigmas."""
+    messages: tuple[tuple[Message, ...], ...]
+    """Per part and chain."""
+
+
+def reduce(pieces: Pieces, count: int) -> Reduced:
+    """Sweep one: eliminate all states, then solve for the statics.
+
+    Parameters
+    ----------
+    pieces : callable
+        The part of each number, from 0.
+    count : int
+        How many parts there are.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Something is held by nothing at all; the message names the epoch, counted within its part.
+    """
+    messages: list[tuple[Message, ...]] = []
+    S = b = None
+    decrease = 0.0
+    for i in range(count):
+        piece = pieces(i)
+        if i == 0:
+            S, b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
+            messages.append(tuple(_nothing(chain) for chain in piece.chains))
+        S += piece.C
+        b -= piece.g_z
+        following = []
+        for chain, message in zip(piece.chains, messages[i], strict=True):
+            W = np.concatenate([chain.B, -chain.g[..., None]], axis=-1)
+            W[0] += message.W
+            U, F = _factored(chain, piece, message)
+            blocks.forward(U, F, W, piece.count)
+            flat = W[: piece.count].reshape(-1, W.shape[-1])
+            square = blocks.gram(flat, flat)
+            S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
+            b[chain.columns] -= square[:-1, -1]
+            decrease += float(square[-1, -1])
+            if len(U) > piece.count:
+                following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
+        messages.append(tuple(following))
+    assert S is not None and b is not None
+    S = 0.5 * (S + S.T)
+    dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), b) if len(b) else b
+    return Reduced(S, dz, decrease + float(b @ dz), tuple(messages))
+
+
+def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:
+    """Sweep two: the steps of the states, from the last part to the first.
+
+    Yields
+    ------
+    part : int
+    dx : list of (E, b) arrays
+        Per chain, of the part's epochs and of the one it shares with the next.
+    """
+    following: list[np.ndarray] = []
+    for i in reversed(range(len(reduced.messages) - 1)):
+        piece = pieces(i)
+        out = []
+        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
+            dz = reduced.dz[chain.columns]
+            x = -(chain.g + chain.B @ dz)[..., None]
+            x[0, :, 0] += message.W[:, -1] - message.W[:, :-1] @ dz
+            U, F = _factored(chain, piece, message)
+            blocks.forward(U, F, x, piece.count)
+            if len(x) > piece.count:
+                x[-1, :, 0] = following[c]
+            blocks.backward(U, F, x, piece.count)
+            out.append(x[..., 0])
+        following = [x[0].copy() for x in out]
+        yield i, out
+
+
+@dataclass(frozen=True, eq=False)
+class Inverse:
+    """Published blocks of the inverse, one part of one chain."""
+
+    Z: np.ndarray
+    """(E, b, b) diagonal blocks of ``H_xx^-1``: ``Z_k = U_k^-1 U_k^-T + G_k Z_k+1 G_k'``."""
+    G: np.ndarray
+    """(E - 1, b, b) ``U_k^-1 F_k``: neighbouring blocks follow as ``Z_k,k+1 = -G_k Z_k+1``."""
+    Y: np.ndarray
+    """(E, b, q) ``H_xx^-1 H_xs``: how the states follow the statics, ``dx = -Y dz``."""
+
+
+def inverses(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[Inverse]]]:
+    """Sweep two of the covariances: selected inverse and border, from the last part to the first."""
+    following: list[Inverse] = []
+    for i in reversed(range(len(reduced.messages) - 1)):
+        piece = pieces(i)
+        out = []
+        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
+            Y = chain.B.copy()
+            Y[0] += message.W[:, :-1]
+            U, F = _factored(chain, piece, message)
+            blocks.forward(U, F, Y, piece.count)
+            Z, G = np.empty_like(U), np.empty_like(F)
+            if len(U) > piece.count:
+                Y[-1], Z[-1] = following[c].Y[0], following[c].Z[0]
+            blocks.backward(U, F, Y, piece.count)
+            blocks.selected_inverse(U, F, Z, G, piece.count)
+            out.append(Inverse(Z, G, Y))
+        following = out
+        yield i, out
+
+
+def _nothing(chain: Chain) -> Message:
+    b, q = chain.B.shape[1:]
+    return Message(np.zeros((b, b)), np.zeros((b, q + 1)))
+
+
+def _factored(chain: Chain, piece: Piece, message: Message):
+    """``U`` and ``F`` of ``H_xx = U' U``, given what was eliminated before."""
+    U, F = chain.D.copy(), chain.A.copy()
+    if piece.damping is not None:
+        i = np.arange(U.shape[-1])
+        U[:, i, i] *= 1 + piece.damping[:, None]
+    U[0] += message.D
+    bad = blocks.factor(U, F, piece.count)
+    if bad >= 0:
+        raise np.linalg.LinAlgError(f"block {bad} is not positive definite")
+    return U, F
