@@ -402,3 +402,5 @@ def _tie_findings(machine: Machine, site: Site, seen: Seen) -> Iterator[Finding]
         return
     moving = [name for name, body in machine.bodies.items() if body.kind != "static"]
     yield Finding("ok", f"datum: {', '.join(moving)} are tied to the survey")
+    if untold := [static.name for static in network.statics if not static.surveyed]:
+        yield Finding("ok", f"places that no file gives, for the log to tell: {', '.join(untold)}")

@@ -157,6 +157,16 @@ def test_check_of_a_good_log_is_quick_and_finds_no_error(recorded, gradetrace):
     assert time.monotonic() - started < 15
 
 
+def test_check_names_the_places_that_no_file_gives(job_folder, gradetrace):
+    """A pose that was forgotten is no error; whoever forgot it should read so."""
+    site = job_folder / "site.toml"
+    name, pose = re.search(r"\[benchmarks\.([\w-]+)\][^[]*?(pose = .*\n)", site.read_text()).groups()
+    change(site, pose, "")
+    done = gradetrace("check", job_folder / "short.mcap")
+    assert done.code == 0, done.out
+    assert f"places that no file gives, for the log to tell: benchmark {name} pose" in done.out
+
+
 def test_attachments_of_the_log_describe_it_when_nothing_lies_beside_it(recorded, tmp_path, gradetrace):
     for name in ("short.mcap", "design.csv", "checks.csv"):
         shutil.copy(recorded / name, tmp_path)
