@@ -21,6 +21,9 @@ SHIFT_M, SHIFT_M_S = 0.1, 2.0
 """Between two pictures dt apart a body turns and moves by about the first plus the second times dt. The two branches
 of a marker differ by twice its tilt, as a rule tens of degrees."""
 STEP_CAP = 50.0
+PICTURE_CAP = 4.0
+"""Over time one picture counts for no more than this, so that it takes a run of them to turn a body. With 500 here a
+marker that was flipped in 5 % of its frames took the body along in each of them, by up to 52 deg."""
 TRIALS, WITNESSES = 200, 1000
 """Candidates of an unchanging pose that are tried (those that reproject best), and pictures asked about each."""
 
@@ -66,7 +69,7 @@ def viterbi(candidates, cost, time_s):
     """The cheapest way through the candidates: reprojection, plus how far a body turns and moves in the time."""
     best = np.min(cost, axis=1, keepdims=True)
     with np.errstate(invalid="ignore"):
-        unary = np.where(np.isfinite(cost), np.minimum(cost - best, 10 * STEP_CAP), 1e6)
+        unary = np.where(np.isfinite(cost), np.minimum(cost - best, PICTURE_CAP), 1e6)
     # What is no candidate is priced out above; as the identity it cannot overflow here.
     rows = np.where(np.isfinite(candidates), candidates, np.eye(4))
     n, k = candidates.shape[:2]

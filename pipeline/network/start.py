@@ -9,16 +9,19 @@ import numpy as np
 from pipeline.errors import NetworkError
 from pipeline.geometry import linkage, se3
 from pipeline.network import frames as fr
-from pipeline.network.branches import disagreement, most_agreed, score, viterbi
+from pipeline.network.branches import OTHER_SIGMA_PX, disagreement, most_agreed, score, viterbi
 from pipeline.network.datum import Tie
 from pipeline.network.epochs import Epochs
 from pipeline.network.model import Network
+from pipeline.network.pairs import two_angles
 from pipeline.network.resection import refined
-from pipeline.network.views import View, views_of
+from pipeline.network.views import View, off_px, views_of
 
 BRIDGE_S = 0.5
 """Between two of its pictures this close a body's place is good enough to tell other places from. Across longer gaps it
 is not: a tag first seen while the reference was out of view would start wherever the geodesic happened to pass."""
+ARM_M = 0.05
+"""Two joints about nearly one line, with a shorter arm between them, are not told apart: the first starts at zero."""
 LOST_PX = 5.0
 """A picture whose best pose leaves the median corner further off is no knot of the start."""
 
@@ -157,10 +160,45 @@ class _Search:
             return True
         if not open_:
             return False
+        if self.take_pair():
+            return True
         joints = [key for key in open_ if key[0] == "joint"]
         key = joints[0] if joints else open_[0]
         self.unknown.remove(key)
         self.known[key[1]] = self.asked[key[1]] = True
+        return True
+
+    def take_pair(self) -> bool:
+        """Start the first of two joints that pictures show only together; the second then stands alone."""
+        for view in sorted(self.views, key=lambda v: -len(v.epoch)):
+            keys = [_key(step) for step in view.path]
+            at = [k for k, key in enumerate(keys) if key in self.unknown]
+            if len(at) != 2 or any(keys[k][0] != "joint" for k in at) or keys[at[0]] == keys[at[1]]:
+                continue
+            if self._start_first(view, at):
+                return True
+        return False
+
+    def _start_first(self, view: View, at: list[int]) -> bool:
+        """Start the first of the two joints at these steps of a view's path; False where only their sum shows."""
+        key, second = (_key(view.path[k]) for k in at)
+        before, _, step = self._around(view, key)
+        after = self._around(view, second)[1]
+        _, M = fr.along(view.path[at[0] + 1 : at[1]], lambda edge: self.edge_pose(edge, view.epoch))
+        M = np.broadcast_to(M, before.shape)[:, None]
+        a, b, arm_m = two_angles(se3.inverse(before)[:, None] @ view.poses @ se3.inverse(after)[:, None], M)
+        if not np.nanmedian(arm_m) > ARM_M:
+            return False
+        T = before[:, None] @ fr.turn(a) @ M @ fr.turn(b) @ after[:, None]
+        off = np.where(view.seen[:, None], off_px(T, view.p_marker, view.xy, view.focal_px), 0.0)
+        cost = 0.5 * np.sum(off**2, axis=-1) / OTHER_SIGMA_PX**2
+        E = fr.turn(a / (step.sign * step.edge.ratio))
+        t = self.time_s[view.epoch]
+        E = E[np.arange(len(t)), viterbi(E, np.where(np.isfinite(cost), cost, np.inf), t)]
+        good = np.isfinite(E[:, 0, 0])
+        self._interpolate(key, t[good], E[good])
+        self.known[key[1]] = self.asked[key[1]] = True
+        self.unknown.remove(key)
         return True
 
     def take_views(self, key: tuple[str, int]) -> None:

@@ -81,7 +81,7 @@ class Drawn:
 def draw(scene: Scene, seed: int, flips: float = 0.0) -> Drawn:
     """One truth of a scene, and what its cameras and sensors make of it.
 
-    ``flips`` is the share of tags whose corners are replaced by the picture of the tag in its other planar pose.
+    ``flips`` is the share of a marker's frames in which the picture is that of the marker in its other planar pose.
     """
     rng = np.random.default_rng(seed)
     texts = scene.files()
@@ -131,11 +131,12 @@ def draw(scene: Scene, seed: int, flips: float = 0.0) -> Drawn:
             for key in (mark, f"{name}>{mark}"):
                 for low, high in scene.hidden.get(key, ()):
                     gone |= (t >= low) & (t < high)
+            flipped = rng.random(len(t)) < flips if flips else np.zeros(len(t), dtype=bool)
+            board = np.concatenate([_corners(tag) for tag in document["tags"]])
             for tag in document["tags"]:
                 p = _corners(tag)
                 for i in np.flatnonzero(~gone & _in_front(T, p)):
-                    flip = rng.random() < flips
-                    uv = _picture(_other_pose(T[i], p) if flip else T[i], p, lens)
+                    uv = _picture(_other_pose(T[i], board) if flipped[i] else T[i], p, lens)
                     if (uv > 5).all() and (uv < np.array([1275, 955])).all():
                         noisy = uv + SIGMA_PX * rng.standard_normal((4, 2))
                         rows.append((c, tags[tag["id"]], stamps[i], noisy))
