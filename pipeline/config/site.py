@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from typing import Annotated, Literal
 
 import numpy as np
@@ -163,6 +164,28 @@ class DetectionSettings(Section):
     """Decision margin below which a decoded tag is rejected."""
 
 
+class Split(Section):
+    """A quantity that changed during the log, by its name in the table of statics: two from an instant on."""
+
+    static: Annotated[str, Field(min_length=1)]
+    """Such as `benchmark B2 pose`, `camera cab_left mount`, `sensor pot time offset`."""
+    at: datetime.datetime
+    """First instant of the new one, with its offset from UTC, for example `2026-05-04T10:42:31Z`."""
+
+    @field_validator("at")
+    @classmethod
+    def _which_clock(cls, value: datetime.datetime) -> datetime.datetime:
+        if value.tzinfo is None:
+            raise ValueError("say which clock: write the offset from UTC, such as 2026-05-04T10:42:31Z")
+        return value
+
+    @property
+    def at_ns(self) -> int:
+        """Nanoseconds UTC."""
+        since = self.at - datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
+        return (since.days * 86_400 + since.seconds) * 10**9 + since.microseconds * 1000
+
+
 class EstimationSettings(Section):
     huber: Positive = 2.5
     """Corner residual, in its own sigmas, beyond which its weight falls."""
@@ -170,6 +193,11 @@ class EstimationSettings(Section):
     max_gap_s: Positive = 0.3
     """States further than this from an observation of their body are marked `bridged`: a frame and a half at 5 Hz.
     Further out the motion prior alone speaks; at 0.5 s a swinging bucket was 20 cm off, 3.6 of its sigmas."""
+    split: tuple[Split, ...] = ()
+    """Benchmarks, mounts and sensors that changed during the log: what the files say holds before, and after it the
+    quantity is free. The change test names what and when."""
+    cross_validation: bool = True
+    """Adjust odd and even frames apart and compare; costs about two of the adjustment's iterations."""
 
 
 class SurveySettings(Section):

@@ -22,7 +22,9 @@ from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, problem_of
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.estimation.repeated import WHITE, Repeated, with_offsets
+from pipeline.estimation.self_check import examine
 from pipeline.estimation.solution import BodyStates, Solution
+from pipeline.estimation.split import told
 from pipeline.estimation.values import Values, statics_of
 from pipeline.estimation.variances import settle
 from pipeline.network import frames as fr
@@ -75,7 +77,7 @@ def adjust(
     network = with_offsets(network, observations, repeated)
     tied = tie_network(network, observations, readings)
     epochs = epochs_of(network, observations.take(tied.used), readings)
-    problem = problem_of_log(network, tied, epochs, repeated)
+    problem = told(problem_of_log(network, tied, epochs, repeated), settings.split)
     optimum = optimise(problem, settings.huber, settings.max_iterations)
     if not optimum.converged and optimum.last_step_sigmas > LOST_SIGMAS:
         raise EstimationError(
@@ -114,6 +116,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
     states = []
     budget: dict = {}
     by_class: dict = {}
+    edge_seen = np.zeros(len(problem.epochs.time_ns), dtype=bool)
     lasting: dict = {}
     for name in [*problem.network.bodies, fr.TOOL]:
         frame = fr.TOOL if name == fr.TOOL else fr.body_frame(name)
@@ -122,6 +125,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         track = body_track(problem, values, found, frame, name)
         rows, body_seen = _published(track, seen, span)
         if name == fr.TOOL:
+            edge_seen[rows] = body_seen[rows]
             classes = epoch_classes(problem, values, track, body_seen)
             budget, by_class = vertical_budgets(problem, found, track, rows, classes)
             lasting = correlation_time(problem, found, track, rows, classes)
@@ -133,7 +137,9 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
     statics = [s for s in diagnostics.static_results(problem, values, found) if s.source != CORNERS]
     motion = diagnostics.motion_fit(problem, values)
     untold = observability.findings(problem)
+    checked, remarks = examine(problem, optimum, settings, found, edge_seen, corner_fits, sensor_fits)
     warnings = [
+        *remarks,
         *problem.tie.warnings,
         *(f.sentence for f in untold if f.kind in ("gauge", "line")),
         *diagnostics.moved_statics(statics),
@@ -176,6 +182,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         "error_budget_by_class": by_class,
         "correlation_time_s": lasting,
         "observability": [asdict(f) for f in untold],
+        **checked,
         "warnings": warnings,
     }
     return Solution(tuple(states), tuple(statics), table, figures, tuple(warnings))
