@@ -270,6 +270,44 @@ def error_budget(inputs: ReportInputs, units: Units, words: Words) -> dict[str, 
     return numbers.table(columns, rows)
 
 
+def budget_by_class(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any] | None:
+    """The same by what the machine was doing: a row per class of epochs with its sigma and that of each source.
+
+    The last column is the time over which the own part stays the same error.
+    """
+    found = inputs.solution.get("error_budget_by_class") or {}
+    if not found:
+        return None
+    lasting = inputs.solution.get("correlation_time_s") or {}
+    sources = [s for s in next(iter(found.values())) if s not in ("epochs", "sigma")]
+    columns = [
+        column("class", words("columns.class")),
+        column("epochs", words("columns.epochs"), "", 0),
+        column("sigma", words("columns.sigma"), units.deviation, units.fine_digits),
+        *(
+            column(
+                s,
+                words(f"sources.{s}") if words.has(f"sources.{s}") else s,
+                units.deviation,
+                units.fine_digits,
+            )
+            for s in sources
+        ),
+        column("lasts", words("columns.lasts"), "s", 2),
+    ]
+    rows = [
+        {
+            "class": words(f"classes.{name}"),
+            "epochs": parts["epochs"],
+            "sigma": units.to_deviation(parts["sigma"]),
+            "lasts": lasting.get(name),
+        }
+        | {s: units.to_deviation(parts[s]) for s in sources}
+        for name, parts in found.items()
+    ]
+    return numbers.table(columns, rows)
+
+
 def budget_parts(inputs: ReportInputs, words: Words) -> list[tuple[str, float]]:
     """Source and sigma in metres, the largest first."""
     found = inputs.solution.get("error_budget") or {}

@@ -370,6 +370,11 @@ SOLUTION = {
         "cutting edge": 0.0010,
         "time offset": 0.0002,
     },
+    "error_budget_by_class": {
+        "digging": {"epochs": 1500, "sigma": 0.0049, "own": 0.0019, "benchmarks": 0.0019},
+        "bridged": {"epochs": 60, "sigma": 0.031, "own": 0.0305, "benchmarks": 0.0019},
+    },
+    "correlation_time_s": {"median": 0.31, "longest": 2.4, "digging": 0.31, "bridged": 1.72},
     "warnings": ["benchmark BM2 moved 3.5 sigma from its file value"],
 }
 SURVEY = {

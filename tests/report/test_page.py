@@ -172,6 +172,16 @@ def test_stations_on_the_page_are_those_of_the_table(unit):
         assert as_float(row[7]) == pytest.approx(common * fall, abs=limit)
 
 
+def test_the_budget_stands_by_what_the_machine_was_doing(page):
+    by_class = page.content["error_budget_by_class"]
+    rows = {row["class"]: row for row in by_class["rows"]}
+    assert list(rows) == ["digging", "bridged"]
+    assert rows["bridged"]["own"] == 30.5  # mm
+    assert rows["digging"]["sigma"] == 4.9
+    assert rows["digging"]["lasts"] == 0.31  # s, of the own part alone
+    assert "bridged" in page.html
+
+
 def test_the_statistics_are_those_of_the_survey_stage(page):
     inputs = made_up_inputs()
     shown = {entry["key"]: entry["number"]["value"] for entry in page.content["check_statistics"]}
