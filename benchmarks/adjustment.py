@@ -1,0 +1,240 @@
+"""A whole shift adjusted at once, time and memory by its length: `make bench-adjustment`.
+
+Two bodies with rates (a cab that swings, a stick), two cameras on the cab, two surveyed boards, a marker of two tags on
+the stick; 44 statics with priors. Corners come straight from the geometry, no pictures: 0.2 px of noise, 10 Hz, the
+boards blind for up to 4 s in 13 % of the time, the stick's marker in 20 %. Each length runs in a process of its own;
+measured is the way from observations to the marginals of every state and static: ties, epochs, start, iterations,
+covariances with their own and common part, and the cutting edge's. Tables and diagnostics that `adjust` makes of
+them are not in it.
+
+Bars: 288,000 epochs in 3 minutes and 2 GB; time per epoch flat from 10,000 epochs up (within 25 %). On a machine that
+does other work too, hold the processor's seconds against them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import dataclasses
+import json
+import resource
+import subprocess
+import sys
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks._results import keep_result
+from pipeline.config import Machine, Site
+from pipeline.config.site import EstimationSettings
+from pipeline.estimation.adjust import problem_of_log
+from pipeline.estimation.marginals import body_track, common_part, marginals_by_part
+from pipeline.estimation.optimise import optimise
+from pipeline.geometry import camera as camera_model
+from pipeline.geometry import se3, so3
+from pipeline.network import Network, Observations, network_of
+from pipeline.network import frames as fr
+from pipeline.network.datum import tie
+from pipeline.network.epochs import epochs_of
+from tests.estimation.simulator import MACHINE, SITE, T0_NS
+
+LENGTHS = (1_000, 10_000, 100_000, 288_000)
+SECONDS_BAR, MEGABYTES_BAR, FLAT_BAR = 180.0, 2000.0, 1.25
+FRAME_S, SIGMA_PX = 0.1, 0.2
+CYCLE_S = 18.0
+BLIND = {"cab": 0.13, "stick": 0.2}
+BLIND_S = 4.0
+
+
+@dataclass(frozen=True)
+class Row:
+    """One length."""
+
+    epochs: int
+    tags: int
+    unknowns: int
+    iterations: int
+    converged: bool
+    cost: float
+    seconds: float
+    start_cpu_s: float
+    """Processor's seconds for ties, epochs, start and sorting."""
+    iterations_cpu_s: float
+    marginals_cpu_s: float
+    megabytes: float
+    """Largest resident size of the process, input included."""
+    input_megabytes: float
+    """The same before."""
+    median_sigma_mm: float
+    """Of the cutting edge's elevation: median over the epochs."""
+
+    @property
+    def cpu_seconds(self) -> float:
+        return self.start_cpu_s + self.iterations_cpu_s + self.marginals_cpu_s
+
+    @property
+    def microseconds_per_epoch(self) -> float:
+        """Of the processor."""
+        return 1e6 * self.cpu_seconds / self.epochs
+
+
+def network_drawn() -> Network:
+    """Cab and stick, two cameras, two boards of one tag, a marker of two."""
+    machine: Any = copy.deepcopy(MACHINE)
+    site: Any = copy.deepcopy(SITE)
+    del machine["bodies"]["bucket"], machine["sensors"], machine["motion"]["bucket"]
+    machine["cutting_edge"]["body"] = "stick"
+    machine["motion"]["cab"] = {"translation": 1e-3, "rotation": 3e-2}
+    machine["motion"]["stick"] = {"translation": 2e-1, "rotation": 3e-2}
+    for camera in machine["cameras"].values():
+        camera["intrinsics"]["sigma"] = [1.0] * 4 + [0.0] * 5
+    site["benchmarks"] = {name: site["benchmarks"][name] for name in ("B1", "B2")}
+    for board in site["benchmarks"].values():
+        board["tags"] = [{"id": board["tags"][0]["id"], "size_m": 0.5}]
+    return network_of(Machine.model_validate(machine), Site.model_validate(site))
+
+
+def corners_drawn(network: Network, epochs: int, seed: int = 0) -> Observations:
+    """Noisy corners of a log of this length; the statics differ from the files by draws from their priors."""
+    rng = np.random.default_rng(seed)
+    truth = {}
+    for s in network.statics:
+        error = s.scale @ rng.standard_normal(s.scale.shape[1])
+        truth[s.name] = s.value @ se3.exp(error) if s.is_pose else s.value + error
+    t = np.arange(epochs) * FRAME_S
+    phase = 2 * np.pi * t / CYCLE_S
+    wobble = np.cumsum(rng.standard_normal((epochs, 3)), axis=0) * 1e-5
+    turn = np.stack([0.01 * np.sin(3 * phase), 0.01 * np.cos(2 * phase), 0.12 * np.sin(phase)], axis=-1)
+    way = np.stack([0.02 * np.sin(2 * phase), 0.02 * np.cos(phase), 1.5 + 0.01 * np.sin(3 * phase)], axis=-1)
+    T_world_cab = se3.from_rotation_translation(so3.exp(turn), way + wobble)
+    stick_turn = np.stack([0.25 * np.sin(phase + 1), 0.02 * np.sin(phase), 0.02 * np.cos(phase)], axis=-1)
+    stick_way = np.stack([1.0 + 0 * t, 6.0 + 0.5 * np.sin(phase), -1.2 + 0.4 * np.cos(phase)], axis=-1)
+    T_cab_stick = se3.from_rotation_translation(so3.exp(stick_turn), stick_way)
+    T_world = {"world": se3.identity((epochs,)), "cab": T_world_cab, "stick": T_world_cab @ T_cab_stick}
+    blind = {body: _blind(rng, epochs, share) for body, share in BLIND.items()}
+    parts = []
+    for c, camera in enumerate(network.cameras):
+        T_camera_world = se3.inverse(T_world[camera.body] @ truth[f"camera {camera.name} mount"])
+        for k, m in enumerate(network.tag_marker):
+            marker = network.markers[m]
+            if marker.benchmark == (camera.name == "dig"):
+                continue
+            name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
+            T = T_camera_world @ T_world[marker.body] @ truth[name]
+            p = se3.transform(T[:, None], network.tag_corners[k])
+            uv = camera_model.project(p, truth[f"camera {camera.name} intrinsics"])
+            size = np.array([camera.width, camera.height])
+            inside = np.all((uv > 5) & (uv < size - 5), axis=(1, 2)) & (p[..., 2].min(axis=1) > 0.5)
+            hidden = blind["cab"] if marker.benchmark else blind["stick"] & ~blind["cab"]  # no epoch is empty
+            rows = np.flatnonzero(inside & ~hidden)
+            parts.append((np.full(len(rows), c), np.full(len(rows), k), rows, uv[rows]))
+    camera_index, tag, frame, uv = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort([tag, camera_index, frame])
+    uv = uv[order] + SIGMA_PX * rng.standard_normal(uv.shape)
+    cov = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(order), 4, 2, 2)).copy()
+    time_ns = T0_NS + frame[order] * round(FRAME_S * 1e9)
+    return Observations(camera_index[order], tag[order], time_ns, uv, cov)
+
+
+def _blind(rng, epochs: int, share: float) -> np.ndarray:
+    """(epochs,) bool: gaps of up to BLIND_S that fill about this share; never the first second."""
+    out = np.zeros(epochs, dtype=bool)
+    for start in rng.integers(10, max(epochs, 11), round(share * epochs * FRAME_S / (0.5 * BLIND_S))):
+        out[start : start + rng.integers(1, round(BLIND_S / FRAME_S))] = True
+    return out
+
+
+def run(epochs: int) -> Row:
+    """Adjust a log of this length, in this process."""
+    network = network_drawn()
+    _adjusted(network, corners_drawn(network, 50))  # loads what numba has compiled
+    observations = corners_drawn(network, epochs)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    started = time.monotonic()
+    problem, optimum, sigma, cpu = _adjusted(network, observations)
+    return Row(
+        len(problem.epochs.time_ns),
+        len(observations.tag),
+        problem.statics.size + len(problem.epochs.time_ns) * sum(v.size for v in problem.tie.variables),
+        optimum.iterations,
+        optimum.converged,
+        optimum.cost,
+        time.monotonic() - started,
+        cpu[0],
+        cpu[1],
+        cpu[2],
+        resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        before,
+        1000 * float(np.median(sigma)),
+    )
+
+
+def _adjusted(network: Network, observations: Observations):
+    clock = [time.process_time()]
+    tied = tie(network, observations, {})
+    problem = problem_of_log(network, tied, epochs_of(network, observations.take(tied.used), {}))
+    clock.append(time.process_time())
+    settings = EstimationSettings()
+    optimum = optimise(problem, settings.huber, settings.max_iterations)
+    clock.append(time.process_time())
+    sigma = np.empty(len(problem.epochs.time_ns))
+    for part, found in marginals_by_part(problem, optimum.values, optimum.weights):
+        track = body_track(part.problem, part.values, found, fr.TOOL, "tool")
+        cov = (track.own + common_part(track, found.P_zz))[: part.epochs, :3, :3]
+        up = track.T_world_body[: part.epochs, 2, :3]
+        sigma[part.start : part.stop] = np.sqrt(np.einsum("ni,nij,nj->n", up, cov, up))
+    clock.append(time.process_time())
+    return problem, optimum, sigma, np.diff(clock).tolist()
+
+
+def main() -> int:
+    """Print the table and the verdict; 1 if a bar is missed."""
+    parser = argparse.ArgumentParser(prog="make bench-adjustment", description=__doc__.split("\n\n")[0])
+    parser.add_argument(
+        "--epochs", type=int, nargs="+", default=list(LENGTHS), help="lengths, in place of all four"
+    )
+    parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.one is not None:
+        print(json.dumps(dataclasses.asdict(run(arguments.one))))
+        return 0
+    print(f"{'epochs':>8} {'tags':>8} {'iterations':>10} {'s':>7} {'CPU s':>7} {'start':>6} {'iter.':>6} "
+          f"{'marg.':>6} {'MB':>6} {'input':>6} {'us/epoch':>8} {'sigma mm':>8}")  # fmt: skip
+    rows = []
+    for epochs in arguments.epochs:
+        command = [sys.executable, "-m", "benchmarks.adjustment", "--one", str(epochs)]
+        done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True)
+        row = Row(**json.loads(done.stdout.splitlines()[-1]))
+        rows.append(row)
+        print(f"{row.epochs:8d} {row.tags:8d} {row.iterations:10d} {row.seconds:7.1f} {row.cpu_seconds:7.1f} "
+              f"{row.start_cpu_s:6.1f} {row.iterations_cpu_s:6.1f} {row.marginals_cpu_s:6.1f} {row.megabytes:6.0f} "
+              f"{row.input_megabytes:6.0f} {row.microseconds_per_epoch:8.0f} {row.median_sigma_mm:8.2f} "
+              f"{'#' * round(row.microseconds_per_epoch / 20)}", flush=True)  # fmt: skip
+    missed = [f"{row.epochs} epochs did not converge" for row in rows if not row.converged]
+    long = [row.microseconds_per_epoch for row in rows if row.epochs >= 9_000]
+    if long and max(long) > FLAT_BAR * long[0]:
+        missed.append(f"time per epoch not flat ({max(long) / long[0]:.2f} times that of the shortest)")
+    last = rows[-1]
+    if last.epochs < LENGTHS[-1]:
+        missed.append(f"{LENGTHS[-1]} epochs not run")
+    if last.seconds > SECONDS_BAR or last.megabytes > MEGABYTES_BAR:
+        missed.append(f"{last.epochs} epochs beyond {SECONDS_BAR:.0f} s or {MEGABYTES_BAR:.0f} MB")
+    line = (
+        f"adjustment: {last.epochs} epochs, {last.unknowns} unknowns, {last.iterations} iterations in "
+        f"{last.seconds:.0f} s ({last.cpu_seconds:.0f} of the processor), {last.megabytes:.0f} MB, "
+        f"{last.microseconds_per_epoch:.0f} us an epoch"
+        + (f"; MISSED: {', '.join(missed)}" if missed else "")
+    )
+    keep_result(
+        "adjustment",
+        [{**dataclasses.asdict(row), "us_per_epoch": row.microseconds_per_epoch} for row in rows],
+        line,
+    )
+    print(line)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
