@@ -59,9 +59,15 @@ def findings(problem: Problem) -> tuple[Finding, ...]:
 
 
 def information(problem: Problem) -> np.ndarray:
-    """(p, p) information of the data about the statics' unknowns, whose prior has the identity."""
+    """(p, p) information of the data about the statics' unknowns, whose prior has I; inf if it cannot be had."""
     chains, C, g_z = linearise(problem, problem.first, keep_all(problem, HUBER))
-    return arrow.solve(chains, C, g_z).S - np.eye(problem.statics.size)
+    for damping in (0.0, 1e-9, 1e-6):  # where the start is poor, rounding may leave the matrix indefinite
+        try:
+            S = arrow.solve(chains, C, g_z, np.full(len(problem.epochs.time_ns), damping)).S
+            return S - np.eye(problem.statics.size)
+        except np.linalg.LinAlgError:
+            continue
+    return np.full((problem.statics.size,) * 2, np.inf)
 
 
 def null_space(H, limit: float):
@@ -74,6 +80,8 @@ def _statics(problem: Problem) -> list[Finding]:
     if problem.statics.size == 0 or not problem.chains:
         return []
     H = information(problem)
+    if not np.all(np.isfinite(H)):
+        return []
     columns = problem.statics.columns
     named = [k for k, s in enumerate(problem.network.statics) if s.source in SOURCES and len(columns[k])]
     alone = {k: null_space(H[np.ix_(columns[k], columns[k])], TELLS).shape[1] for k in named}

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pipeline.estimation import adjust
+from pipeline.estimation import adjust, observability
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.observability import findings, information, null_space
 from pipeline.network.datum import tie
@@ -127,3 +127,22 @@ def test_the_data_tell_nothing_in_the_null_space_and_something_beside_it():
     assert np.linalg.norm(z - N @ (N.T @ z)) < 1e-3 * np.linalg.norm(z)
     z[6:] *= -1
     assert np.linalg.norm(z - N @ (N.T @ z)) > 0.3 * np.linalg.norm(z)
+
+
+def test_of_a_long_log_stretches_are_looked_at_and_the_same_is_found(monkeypatch):
+    problem = _problem(draw(_scene("third-camera", epochs=150), 1))
+    whole = [f.quantities for f in findings(problem)]
+    monkeypatch.setattr(observability, "EPOCHS", 40)
+    monkeypatch.setattr(observability, "STRETCHES", 4)
+    part = findings(problem)
+    assert [f.quantities for f in part] == whole
+    assert (part[0].start_ns, part[0].end_ns) == (T0_NS, T0_NS + 149 * 200_000_000)
+
+
+def test_a_start_that_cannot_be_factored_is_no_error(monkeypatch):
+    def singular(*_):
+        raise np.linalg.LinAlgError
+
+    problem = _problem(draw(_scene("third-camera", epochs=10), 1))
+    monkeypatch.setattr(observability.arrow, "solve", singular)
+    assert [f.kind for f in findings(problem)] == []
