@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from pipeline.estimation import arrow, sweeps
+from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise
-from pipeline.estimation.optimise import pieces
+from pipeline.estimation.optimise import optimise, pieces
 from pipeline.estimation.parts import bounds, part_of
 from pipeline.estimation.problem import (
     LOST,
@@ -160,3 +161,23 @@ def test_a_log_in_parts_has_the_step_and_the_inverse_of_the_log_in_one_piece(at,
             np.testing.assert_allclose(ours.Y, Y[cut[i].with_far_end], atol=1e-7 * np.abs(Y).max())
             between = slice(cut[i].start, cut[i].start + len(ours.G))
             np.testing.assert_allclose(ours.G, G[between], atol=1e-7 * np.abs(G).max())
+
+
+def test_a_log_adjusted_in_parts_ends_where_the_log_in_one_piece_does(monkeypatch):
+    """Gross corners, damping, gates and all; in parts of seven epochs, and twice to the same bytes."""
+    drawn = draw(6, Options(epochs=30, outliers=0.02))
+    problem = _problem(drawn)
+    whole = optimise(problem, HUBER, 50)
+    monkeypatch.setattr(
+        "pipeline.estimation.optimise.bounds", lambda problem, size=7: bounds(problem, size=size)
+    )
+    first, second = (optimise(problem, HUBER, 50) for _ in range(2))
+    assert whole.converged and first.converged
+    assert first.cost == pytest.approx(whole.cost, rel=1e-9)
+    P_zz = marginals(problem, first.values, first.weights).P_zz
+    assert np.abs((first.values.z - whole.values.z) / np.sqrt(np.diagonal(P_zz))).max() < 1e-3
+    for a, b in zip(first.weights.corners, whole.weights.corners, strict=True):
+        assert np.array_equal(a, b) and not a.all()
+    assert first.values.z.tobytes() == second.values.z.tobytes()
+    for a, b in zip(first.values.pose, second.values.pose, strict=True):
+        assert a.tobytes() == b.tobytes()
