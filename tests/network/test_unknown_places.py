@@ -15,6 +15,7 @@ from pipeline.geometry import se3
 from pipeline.network import network_of
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
+from pipeline.network.start import _Search
 from tests.estimation.simulator import SITE, Options, draw
 
 UNKNOWN = ("benchmark B2 pose", "benchmark B3 pose", "camera dig mount")
@@ -76,6 +77,15 @@ def test_the_start_grows_outwards_from_what_is_known_over_pictures_that_share_no
         assert (
             np.linalg.norm(off[:3]) < 0.5 and np.linalg.norm(off[3:]) < 0.1
         )  # a flip is off by more than 0.5
+
+
+def test_a_body_is_known_at_its_pictures_and_in_gaps_of_half_a_second_and_no_longer(chain):
+    _, network, problem = chain
+    search = _Search(network, problem.tie, problem.epochs)
+    step_s = problem.epochs.time_s[1]
+    assert step_s == pytest.approx(0.2)
+    known = search._near(np.array([3, 5, 8, 9]))  # gaps of 0.4, 0.6 and 0.2 s
+    assert np.flatnonzero(known).tolist() == [3, 4, 5, 8, 9]
 
 
 def test_places_that_no_file_gives_lie_where_the_truth_was_drawn(chain):
