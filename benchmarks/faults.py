@@ -48,6 +48,7 @@ def main() -> int:
             said, faulty = _judge(injected, found)
             if ratio > WORSE or faulty:
                 missed.append(name or "clean")
+            seconds = time.monotonic() - started
             rows.append(
                 {"faults": list(faults), "seed": seed, "ratio": ratio, "ratio_untold": raw, "changes": said}
             )

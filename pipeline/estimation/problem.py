@@ -221,7 +221,7 @@ def huber(length, k: float, alive):
 
 def lengths(r, group: int):
     """Lengths of the whitened residuals of each corner (group = 2) or reading (group = 1): (n, m / group)."""
-    return np.linalg.norm(r.reshape(len(r), -1, group), axis=-1)
+    return np.linalg.norm(r.reshape(len(r), r.shape[1] // group, group), axis=-1)  # -1 fails on no rows
 
 
 def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):

@@ -106,7 +106,7 @@ def _warnings(inputs: ReportInputs) -> list[Remark]:
 
 
 def _statics_or(section: str, sentence: str) -> str:
-    return "statics" if section == "quality" and " moved " in sentence else section
+    return "statics" if section == "quality" and " from its file value" in sentence else section
 
 
 def _of_log(inputs: ReportInputs, words: Words) -> list[Remark]:

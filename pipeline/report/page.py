@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from pipeline.report import charts, detector, evidence, facts, maps, measured, numbers, palette, profiles
 from pipeline.report.attention import attention
+from pipeline.report.consistency import consistency
 from pipeline.report.drawing import house_style, svg_of
 from pipeline.report.evidence import Timeline
 from pipeline.report.inputs import ReportInputs
@@ -90,6 +91,7 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "coverage": evidence.coverage(inputs, words),
         "detector": {"rejected": detector.rejected(inputs, words), **detector.scatter(inputs, words)},
         "quality": evidence.quality(inputs, words),
+        "consistency": consistency(inputs, words),
         "points": maps.points_table(inputs, units, words),
         **evidence.statics(inputs, words),
         "method": method(inputs, units, words),
