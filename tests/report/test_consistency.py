@@ -66,7 +66,7 @@ def test_benchmarks_left_out_are_judged_one_by_one():
     assert rows["B3"]["easting"] is None and "nothing else" in rows["B3"]["why"]
 
 
-@pytest.mark.parametrize(("ratio", "said"), [(1.0, "is right"), (1.3, "too small"), (0.7, "too large")])
+@pytest.mark.parametrize(("ratio", "said"), [(1.0, "they agree"), (1.3, "too small"), (0.7, "too large")])
 def test_halves_are_said_in_words(ratio, said):
     text = page_with(odd_even={**OWN["odd_even"], "ratio": ratio}).content["consistency"]["halves"]
     assert said in text
