@@ -144,7 +144,7 @@ STAGES = (
     Stage("detect", 3, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        4,
+        5,
         "adjusting the network",
         ("ingest", "detect"),
         (),
