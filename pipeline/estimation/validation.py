@@ -195,7 +195,7 @@ def _solve_many(step: arrow.Step, chains, rhs_x, rhs_z):
     y = [factored.forward(rhs) for factored, rhs in zip(step.factors, rhs_x, strict=True)]
     b = rhs_z.copy()
     for chain, W, y_c in zip(chains, step.W, y, strict=True):
-        b[chain.columns] -= W.reshape(-1, W.shape[-1]).T @ y_c.reshape(-1, y_c.shape[-1])
+        b[chain.columns] -= np.tensordot(W, y_c, axes=([0, 1], [0, 1]))
     dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(step.S), b) if len(b) else b
     dx = [
         factored.backward(y_c - W @ dz[chain.columns])
