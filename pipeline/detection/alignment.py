@@ -209,7 +209,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         elif misfit > (MISFIT_MOST_SHARP if blur_cells < SHARP else MISFIT_MOST):
             reason = BLURRED if blur_cells > 0.7 else MISFIT
         elif share < 1.0 - 2.0 * PARTLY and misfit > MISFIT_MOST_PARTLY:
-            reason = COVERED
+            reason = MISFIT
         else:
             every, within = contradicted(grey, cells, levels, n, lens, bent, H, norm, par)
             if within > CONTRADICTED_MOST * (n - 4) ** 2:
