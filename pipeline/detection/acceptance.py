@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.prints import hamming_limit
 from pipeline.detection.refine import MISFIT, NO_CONTRAST
-from pipeline.detection.seen import Seen
+from pipeline.detection.seen import SEARCHED, Seen
 
 ACCEPTED = "accepted"
 UNKNOWN_ID = "unknown id"
@@ -69,12 +69,14 @@ def _doubled(seen: Seen, settings: DetectionSettings) -> np.ndarray:
     it is more likely a mistake than a second print. Poor is what would be refused by itself, and also what had bits
     corrected and not half the margin of one that had none; that one is refused and the other stays. By margin alone
     nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
-    What the refinement cannot lay the print over is no second print either.
+    What the refinement cannot lay the print over is no second print either, nor a place that only looks like the tag
+    covered and that no search has decoded: following had taken the next print of a board for it.
     """
     doubled = np.zeros(len(seen), bool)
     # A tag that was followed has no margin.
     sound = ~(seen.margin < settings.min_margin) & (seen.hamming <= hamming_limits(seen, settings))
     sound &= (seen.reason != MISFIT) & (seen.reason != NO_CONTRAST)
+    sound &= (seen.reason == "") | (seen.how == SEARCHED)
     places: dict[tuple[str, int], list[int]] = {}
     for k in np.flatnonzero(sound).tolist():
         places.setdefault((seen.family[k], int(seen.tag_id[k])), []).append(k)
