@@ -46,13 +46,6 @@ class Alignment:
     def length(self) -> float:
         return self.end_station - self.start_station
 
-    def bounding_box(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lowest and highest easting, northing of the alignment, (2,) each, metres."""
-        count = max(2, int(self.length) + 2)
-        p = self.points(np.linspace(self.start_station, self.end_station, min(count, 20_000)), 0.0)
-        p = np.concatenate([p, self.start, self.end])
-        return p.min(axis=0), p.max(axis=0)
-
     def points(self, station: np.ndarray, offset: np.ndarray | float) -> np.ndarray:
         """Easting and northing of points given by station and offset.
 
