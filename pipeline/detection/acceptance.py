@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.prints import hamming_limit
 from pipeline.detection.refine import MISFIT, NO_CONTRAST
-from pipeline.detection.seen import SEARCHED, Seen
+from pipeline.detection.seen import Seen
 
 ACCEPTED = "accepted"
 UNKNOWN_ID = "unknown id"
@@ -76,7 +76,7 @@ def _doubled(seen: Seen, settings: DetectionSettings) -> np.ndarray:
     # A tag that was followed has no margin.
     sound = ~(seen.margin < settings.min_margin) & (seen.hamming <= hamming_limits(seen, settings))
     sound &= (seen.reason != MISFIT) & (seen.reason != NO_CONTRAST)
-    sound &= (seen.reason == "") | (seen.how == SEARCHED)
+    sound &= (seen.reason == "") | seen.decoded
     places: dict[tuple[str, int], list[int]] = {}
     for k in np.flatnonzero(sound).tolist():
         places.setdefault((seen.family[k], int(seen.tag_id[k])), []).append(k)

@@ -21,6 +21,7 @@ import numpy as np
 from pipeline.detection.acceptance import KnownTags
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
+from pipeline.detection.found import sides_px
 from pipeline.detection.motion import Drift, Thumbnails
 from pipeline.detection.prints import cells_across
 from pipeline.detection.refine import Refiner
@@ -31,7 +32,6 @@ from pipeline.detection.seen import (
     joined,
     search,
     seen_at,
-    sides_px,
 )
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 

@@ -30,8 +30,6 @@ class Found:
     """(n,) int."""
     uv: np.ndarray
     """(n, 4, 2) corners top-left, top-right, bottom-right, bottom-left of the print; px, top-left pixel at (0, 0)."""
-    side_px: np.ndarray
-    """(n,) mean side of the quad."""
     hamming: np.ndarray
     """(n,) int, corrected bits."""
     margin: np.ndarray
@@ -50,7 +48,15 @@ def gathered(sightings: Iterable[Sighting]) -> Found:
         family=np.array([row.family for row in rows], object),
         tag_id=np.array([row.tag_id for row in rows], np.int32),
         uv=uv,
-        side_px=np.linalg.norm(np.roll(uv, -1, axis=1) - uv, axis=-1).mean(axis=1),
         hamming=np.array([row.hamming for row in rows], np.int32),
         margin=np.array([row.margin for row in rows], float),
     )
+
+
+_BEFORE = [3, 0, 1, 2]
+
+
+def sides_px(uv: np.ndarray) -> np.ndarray:
+    """Mean side of quads, (..., 4, 2) -> (...)."""
+    edge = uv - uv[..., _BEFORE, :]
+    return np.asarray(np.sqrt(edge[..., 0] ** 2 + edge[..., 1] ** 2).mean(axis=-1))

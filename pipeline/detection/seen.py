@@ -8,6 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.found import sides_px
 from pipeline.detection.refine import ALL_PIXELS, Refined, Refiner
 
 SEARCHED = "searched"
@@ -47,6 +48,11 @@ class Seen(Refined):
         """(n,) mean side of each quad."""
         return sides_px(self.uv)
 
+    @property
+    def decoded(self) -> np.ndarray:
+        """(n,) bool: whose id a search has read off the picture."""
+        return np.asarray(self.how == SEARCHED, bool)
+
     def of(self, rows: np.ndarray) -> Seen:
         """Some of them."""
         return Seen(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
@@ -54,15 +60,6 @@ class Seen(Refined):
     def on_tracks(self, track: np.ndarray) -> Seen:
         """The same, of these tracks."""
         return replace(self, track=np.asarray(track, int))
-
-
-_BEFORE = [3, 0, 1, 2]
-
-
-def sides_px(uv: np.ndarray) -> np.ndarray:
-    """Mean side of quads, (..., 4, 2) -> (...)."""
-    edge = uv - uv[..., _BEFORE, :]
-    return np.asarray(np.sqrt(edge[..., 0] ** 2 + edge[..., 1] ** 2).mean(axis=-1))
 
 
 def seen_at(

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from pipeline.config.site import EstimationSettings
+from pipeline.detection.found import sides_px
 from pipeline.detection.stillness import SIZE_CLASSES
 from pipeline.errors import EstimationError
 from pipeline.estimation import changes, split, validation
@@ -89,7 +90,9 @@ def classes(problem: Problem, corner_fits: list[Fit], sensor_fits: list[Fit]) ->
     """
     rows = []
     for c, camera in enumerate(problem.network.cameras):
-        own = [(f, _sides(g.uv)) for g, f in zip(problem.corners, corner_fits, strict=True) if g.camera == c]
+        own = [
+            (f, sides_px(g.uv)) for g, f in zip(problem.corners, corner_fits, strict=True) if g.camera == c
+        ]
         for size in SIZE_CLASSES:
             inside = [(f, (side >= size.low_px) & (side < size.high_px)) for f, side in own]
             high = None if math.isinf(size.high_px) else size.high_px
@@ -146,18 +149,13 @@ def worst(problem: Problem, corner_fits: list[Fit]) -> list[dict]:
                     "tag_id": int(network.tag_id[seen.tag[row]]),
                     "corner": corner,
                     "time_ns": int(seen.time_ns[row]),
-                    "side_px": round(float(_sides(group.uv[i])), 1),
+                    "side_px": round(float(sides_px(group.uv[i])), 1),
                     "normalised": round(float(each[i]), 2),
                     "redundancy": round(float(fit.redundancy[i, 2 * corner]), 3),
                     "weight": round(float(fit.weight[i, 2 * corner]), 3),
                 }
             )
     return sorted(rows, key=lambda row: row["normalised"], reverse=True)[:WORST]
-
-
-def _sides(uv):
-    """Mean side of tags, px: (...,) from (..., 4, 2)."""
-    return np.linalg.norm(uv - np.roll(uv, 1, axis=-2), axis=-1).mean(axis=-1)
 
 
 def describe(problem: Problem, step: split.Step) -> dict:

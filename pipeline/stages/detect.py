@@ -15,7 +15,7 @@ from pipeline.detection.acceptance import ACCEPTED, UNKNOWN_ID, KnownTags
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
-from pipeline.detection.found import Found
+from pipeline.detection.found import Found, sides_px
 from pipeline.detection.prints import SURE_BITS, spare_bits
 from pipeline.detection.slices import CORRUPT, LOST, SEARCHED, Search, given_up, read_piece
 from pipeline.detection.spans import Slice, frames_of, slices_of
@@ -183,7 +183,7 @@ def _believable(tags: Found) -> set[tuple[str, int]]:
     kept: list[int] = []
     for k in sorted(sure, key=lambda row: -spare_bits(str(tags.family[row]))):
         away = np.linalg.norm(tags.uv[kept].mean(axis=1) - tags.uv[k].mean(axis=0), axis=1)
-        if np.all(away > tags.side_px[kept]):
+        if np.all(away > sides_px(tags.uv[kept])):
             kept.append(k)
     return {(str(tags.family[k]), int(tags.tag_id[k])) for k in kept}
 

@@ -5,15 +5,16 @@ import numpy as np
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import judge
 from pipeline.detection.refine import REASONS
-from pipeline.detection.seen import NO_TRACK, SEARCHED, Seen
+from pipeline.detection.seen import FOLLOWED, NO_TRACK, SEARCHED, Seen
 
 SQUARE = np.array([[0, 0], [30, 0], [30, 30], [0, 30.0]])
 SETTINGS = DetectionSettings()
 
 
 def seen(*tags):
-    """Tags as (id, left, top) with optional hamming, margin, reason."""
-    rows = [{"hamming": 0, "margin": 60.0, "reason": "", **(tag[3] if len(tag) > 3 else {})} for tag in tags]
+    """Tags as (id, left, top) with optional hamming, margin, reason, how."""
+    plain = {"hamming": 0, "margin": 60.0, "reason": "", "how": SEARCHED}
+    rows = [plain | (tag[3] if len(tag) > 3 else {}) for tag in tags]
     n = len(tags)
     return Seen(
         family=np.full(n, "tag36h11", object),
@@ -26,7 +27,7 @@ def seen(*tags):
             ("blur_px", "motion_px", "noise", "contrast", "whole", "misfit", "response"), np.ones(n)
         ),
         reason=np.array([row["reason"] for row in rows], object),
-        how=np.full(n, SEARCHED, object),
+        how=np.array([row["how"] for row in rows], object),
         track=np.full(n, NO_TRACK),
     )
 
@@ -58,6 +59,12 @@ def test_of_several_reasons_the_gravest_is_told():
 def test_what_the_print_does_not_fit_is_no_second_print():
     assert statuses((1, 100, 100), (1, 300, 100, {"reason": "does not fit"})) == ["accepted", "does not fit"]
     assert statuses((1, 100, 100), (1, 300, 100, {"reason": "covered"})) == ["twice in one frame"] * 2
+
+
+def test_what_following_holds_for_a_covered_tag_takes_no_other_with_it():
+    """On a board of equal squares it had laid the covered tag's print over the next one."""
+    covered = {"reason": "covered", "how": FOLLOWED, "margin": np.nan}
+    assert statuses((1, 100, 100), (1, 300, 100, covered)) == ["accepted", "covered"]
 
 
 def test_a_tag_that_was_followed_has_no_margin_and_is_judged_by_its_fit():

@@ -6,6 +6,7 @@ import pytest
 from benchmarks._tag_picture import View, picture
 from pipeline.config.site import DetectionSettings
 from pipeline.detection.apriltag import TagFinder
+from pipeline.detection.found import sides_px
 
 FAMILIES = ("tag36h11", "tag25h9", "tag16h5", "tagStandard41h12")
 # Neither upright nor symmetric: a corner order that is rolled, or runs the other way, cannot pass.
@@ -31,7 +32,9 @@ def test_corners_are_those_of_the_print_in_our_order_and_origin(family, roll_deg
     found = TagFinder([family]).find(grey)
     (k,) = np.flatnonzero(found.tag_id == 3)  # tag16h5 also sees tags where there are none
     assert np.abs(found.uv[k] - uv).max() < 0.2
-    assert found.side_px[k] == pytest.approx(np.linalg.norm(np.roll(uv, -1, 0) - uv, axis=1).mean(), abs=0.1)
+    assert sides_px(found.uv)[k] == pytest.approx(
+        np.linalg.norm(np.roll(uv, -1, 0) - uv, axis=1).mean(), abs=0.1
+    )
 
 
 def test_the_pixel_origin_is_the_centre_of_the_top_left_pixel():
