@@ -140,13 +140,42 @@ def solve(chains, C, g_z, damping=None) -> Step:
         factors.append(factored)
         forwards.append(Wy)
     S = 0.5 * (S + S.T)
+    W, y = [Wy[..., :-1] for Wy in forwards], [Wy[..., -1:] for Wy in forwards]
+    dx, dz = _back(chains, factors, W, S, y, b[:, None])
+    return Step(tuple(x[..., 0] for x in dx), dz[:, 0], S, tuple(factors), tuple(W))
+
+
+def solve_again(step: Step, chains, rhs_x, rhs_z):
+    """``H^-1`` times other right-hand sides, with the factors of a step.
+
+    Parameters
+    ----------
+    step : Step
+        Of ``solve``.
+    chains : sequence of Chain
+        Those that it solved.
+    rhs_x : sequence of (E, b, r) arrays
+        Per chain.
+    rhs_z : (p, r) array
+        Of the statics.
+
+    Returns
+    -------
+    dx : list of (E, b, r) arrays
+    dz : (p, r) array
+    """
+    y = [factored.forward(rhs) for factored, rhs in zip(step.factors, rhs_x, strict=True)]
+    b = rhs_z.copy()
+    for chain, W, y_c in zip(chains, step.W, y, strict=True):
+        b[chain.columns] -= np.tensordot(W, y_c, axes=([0, 1], [0, 1]))
+    return _back(chains, step.factors, step.W, step.S, y, b)
+
+
+def _back(chains, factors, W, S, y, b):
+    """States and statics from what is left of the right-hand sides once the states are eliminated."""
     dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), b) if len(b) else b
-    dx, W = [], []
-    for chain, factored, Wy in zip(chains, factors, forwards, strict=True):
-        y = Wy[..., -1] - Wy[..., :-1] @ dz[chain.columns]
-        dx.append(factored.backward(y[..., None])[..., 0])
-        W.append(Wy[..., :-1])
-    return Step(tuple(dx), dz, S, tuple(factors), tuple(W))
+    parts = zip(chains, factors, W, y, strict=True)
+    return [factored.backward(y_c - W_c @ dz[chain.columns]) for chain, factored, W_c, y_c in parts], dz
 
 
 def border(step: Step) -> tuple[np.ndarray, ...]:

@@ -15,6 +15,7 @@ from pipeline.estimation.diagnostics import Fit
 from pipeline.estimation.marginals import Marginals
 from pipeline.estimation.optimise import Optimum
 from pipeline.estimation.problem import Problem
+from pipeline.estimation.steps import testable
 
 WORST = 10
 """Tags that are listed."""
@@ -60,7 +61,7 @@ def examine(
     predicted = validation.left_out(problem, optimum.values, found)
     sentences = [one["sentence"] for one in told]
     for name, one in predicted.items():
-        if one.get("chance", 1.0) < validation.OFF_CHANCE:
+        if one.get("off", False):
             e, n, h = one["difference_mm"]
             sentences.append(
                 f"benchmark {name} is not where the rest of the log puts it: by {e:+.0f} mm in easting, {n:+.0f} in "
@@ -72,7 +73,7 @@ def examine(
         "left_out": predicted,
         "odd_even": halves,
         "changes": {
-            "tested": [problem.network.statics[s].name for s in changes.testable(problem)] if short else [],
+            "tested": [problem.network.statics[s].name for s in testable(problem)] if short else [],
             "instants": len(changes.instants(problem)),
             "needed": changes.FEWEST,
             "why": why,

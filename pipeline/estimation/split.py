@@ -14,6 +14,7 @@ from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.residuals import Corners, SensorReadings
+from pipeline.estimation.steps import mounts_and_sensors
 from pipeline.estimation.values import Statics, Values
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
@@ -170,7 +171,7 @@ def told(problem: Problem, splits) -> Problem:
     """
     for one in splits:
         known = {s.name: k for k, s in enumerate(problem.network.statics)}
-        allowed = changes.mounts_and_sensors(problem)
+        allowed = mounts_and_sensors(problem)
         if known.get(one.static) not in allowed:
             names = ", ".join(f"'{problem.network.statics[s].name}'" for s in sorted(allowed))
             raise EstimationError(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 import scipy.stats
 
 from pipeline.estimation import arrow
@@ -42,8 +41,8 @@ def left_out(problem: Problem, values: Values, found: Marginals) -> dict[str, di
     -------
     dict of str to dict
         By benchmark: ``difference_mm`` (predicted minus surveyed, along the world's axes), ``sigma_mm`` (of the
-        difference, the survey's own included), ``normalised`` (its length in sigmas), ``chance`` (of one as long), or
-        ``why`` it cannot be predicted.
+        difference, the survey's own included), ``normalised`` (its length in sigmas), ``chance`` (of one as long) and
+        ``off`` (it is below ``OFF_CHANCE``), or ``why`` it cannot be predicted.
     """
     out: dict[str, dict] = {}
     for marker in problem.network.markers:
@@ -68,11 +67,13 @@ def left_out(problem: Problem, values: Values, found: Marginals) -> dict[str, di
             continue
         difference = R @ (scale @ predicted)[:3]
         length = float(difference @ np.linalg.lstsq(cov, difference, rcond=1e-12)[0])
+        chance = float(scipy.stats.chi2.sf(length, 3))
         out[marker.name] = {
             "difference_mm": [round(1000 * float(v), 2) for v in difference],
             "sigma_mm": [round(1000 * float(v), 2) for v in sigma],
             "normalised": round(float(np.sqrt(length)), 2),
-            "chance": float(f"{scipy.stats.chi2.sf(length, 3):.2g}"),
+            "chance": float(f"{chance:.2g}"),
+            "off": bool(chance < OFF_CHANCE),
         }
     return out
 
@@ -113,7 +114,7 @@ def odd_even(problem: Problem, values: Values, weights: Weights, seen) -> dict:
         rhs_x = [a + b for a, b in zip(x, prior[0], strict=True)]
         rhs_z = z + prior[1]
         rhs_z[held] = 0.0
-        drawn = _solve_many(step, chains, rhs_x, rhs_z)
+        drawn = arrow.solve_again(step, chains, rhs_x, rhs_z)
         moved = [(step.dx, step.dz)]
         moved += [(tuple(dx[..., d] for dx in drawn[0]), drawn[1][:, d]) for d in range(DRAWS)]
         pairs.append([_elevation(problem, values, dx, dz)[seen] for dx, dz in moved])
@@ -188,20 +189,6 @@ def _measurement_noise(problem: Problem, values: Values, weights: Weights, chain
         r, J = sensor_residuals(readings, values, problem.statics)
         add(readings.epoch, r, J, 1, alive, 1.0)
     return x, z
-
-
-def _solve_many(step: arrow.Step, chains, rhs_x, rhs_z):
-    """``H^-1`` times several right-hand sides, with the factors of a step."""
-    y = [factored.forward(rhs) for factored, rhs in zip(step.factors, rhs_x, strict=True)]
-    b = rhs_z.copy()
-    for chain, W, y_c in zip(chains, step.W, y, strict=True):
-        b[chain.columns] -= np.tensordot(W, y_c, axes=([0, 1], [0, 1]))
-    dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(step.S), b) if len(b) else b
-    dx = [
-        factored.backward(y_c - W @ dz[chain.columns])
-        for chain, factored, W, y_c in zip(chains, step.factors, step.W, y, strict=True)
-    ]
-    return dx, dz
 
 
 def _elevation(problem: Problem, values: Values, dx, dz):

@@ -93,7 +93,7 @@ def _left_out(found: dict[str, Any], words: Words) -> Part:
             "normalised": one.get("normalised"),
             "why": one.get("why", ""),
         }
-        row["why"] = row["why"] or words("consistency.off" if one["chance"] < 1e-3 else "consistency.fits")
+        row["why"] = row["why"] or words("consistency.off" if one["off"] else "consistency.fits")
         for i, axis in enumerate(axes):
             row[axis] = one["difference_mm"][i] if "difference_mm" in one else None
             row[f"sigma_{axis}"] = one["sigma_mm"][i] if "sigma_mm" in one else None

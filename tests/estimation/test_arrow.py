@@ -42,6 +42,19 @@ def test_the_step_solves_the_dense_system():
     np.testing.assert_allclose(step.dz, expected[starts[-1] :], rtol=1e-9, atol=1e-11)
 
 
+def test_other_right_hand_sides_are_solved_with_the_same_factors():
+    chains, C, g_z = _chains(2)
+    H, g, starts = dense.assemble(chains, C, g_z)
+    rng = np.random.default_rng(5)
+    rhs = rng.standard_normal((len(g), 3))
+    expected = np.linalg.solve(H, rhs)
+    parts = [rhs[a:b].reshape(*c.g.shape, 3) for c, a, b in zip(chains, starts, starts[1:], strict=False)]
+    dx, dz = arrow.solve_again(arrow.solve(chains, C, g_z), chains, parts, rhs[starts[-1] :])
+    for x, a, b in zip(dx, starts, starts[1:], strict=False):
+        np.testing.assert_allclose(x.reshape(b - a, 3), expected[a:b], rtol=1e-9, atol=1e-11)
+    np.testing.assert_allclose(dz, expected[starts[-1] :], rtol=1e-9, atol=1e-11)
+
+
 def test_marginals_are_blocks_of_the_dense_inverse():
     chains, C, g_z = _chains(1)
     H, _, starts = dense.assemble(chains, C, g_z)

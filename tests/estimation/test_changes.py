@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.site import EstimationSettings, Split
-from pipeline.estimation import adjust, changes, split
+from pipeline.estimation import adjust, changes, split, steps
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import optimise
@@ -36,7 +36,7 @@ def test_scores_and_information_of_a_step_are_those_of_one_more_dense_column():
     values = problem.first
     weights = changes.wide_weights(problem, values, 1e6)
     at = np.array([0, 4, 11, 20])
-    found = changes.sums(problem, values, weights, at)
+    found = steps.sums(problem, values, weights, at)
     chains, C, g_z = linearise(problem, values, weights)
     H, gradient, starts = dense.assemble(chains, C, g_z)
     scale = 1 / np.sqrt(np.diagonal(H))

@@ -23,8 +23,8 @@ OWN = {
     "changes": {"tested": ["benchmark B2 pose"], "instants": 180, "needed": 16, "why": "", "found": [CHANGE]},
     "odd_even": {"epochs": 9, "observed_mm": 2.1, "predicted_mm": 2.0, "ratio": 1.05, "ratio_95": [0.9, 1.1]},
     "left_out": {
-        "B1": {"difference_mm": [1, -2, 3], "sigma_mm": [2, 2, 3], "normalised": 1.5, "chance": 0.5},
-        "B2": {"difference_mm": [9, 9, 9], "sigma_mm": [1, 1, 1], "normalised": 15.6, "chance": 0.0},
+        "B1": {"difference_mm": [1, -2, 3], "sigma_mm": [2, 2, 3], "normalised": 1.5, "off": False},
+        "B2": {"difference_mm": [9, 9, 9], "sigma_mm": [1, 1, 1], "normalised": 15.6, "off": True},
         "B3": {"why": "nothing else in this log tells its place"},
     },
     "classes": [
