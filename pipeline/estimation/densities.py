@@ -11,6 +11,11 @@ expectation-maximisation, ``q (sum |e|² + T) / N``, has the same fixed point bu
 
 One density for a shift would be the mean of work and rest; so the intervals of a body are sorted first: **parked**
 where the pictures and readings of two seconds show nothing but noise, **tramming** where it travels, else **working**.
+
+Finer sorting was tried, with a level of its own for every three seconds: a cab that shakes at up to 4 Hz, filmed at
+5 Hz, then got an own sigma of 2.3 mm at the edge where it was 4.5 mm off. What lies above half the frame rate is folded
+into what is seen as slow motion, and no likelihood of the pictures brings it back; the mean over work, with its swings,
+states 4.1 mm.
 """
 
 from __future__ import annotations
