@@ -241,7 +241,8 @@ def _global_test(inputs: ReportInputs, words: Words) -> str:
     if test.get("passed") is None or not test.get("bounds_95"):
         return ""
     low, high = (f"{bound:.3f}" for bound in test["bounds_95"])
-    return words("quality.passed_yes" if test["passed"] else "quality.passed_no", low=low, high=high)
+    side = "yes" if test["passed"] else "low" if test["sigma0_squared"] < test["bounds_95"][0] else "high"
+    return words(f"quality.passed_{side}", low=low, high=high)
 
 
 def _labelled(figures: list[tuple[str, numbers.Number]], words: Words) -> list[dict[str, Any]]:

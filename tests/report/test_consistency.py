@@ -79,3 +79,12 @@ def test_what_was_not_tested_is_said_and_what_was_not_made_is_left_out():
     assert "too short" in page_with(changes=short).html
     bare = render(dataclasses.replace(made_up_inputs(), solution=copy.deepcopy(SOLUTION)))
     assert "table-consistency" not in bare.html and bare.content["consistency"]["changes_sentence"] == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(0.61, "safe side"), (1.0, "passed, bounds 0.968 to 1.033"), (1.9, "more scatter")]
+)
+def test_the_global_test_says_on_which_side_it_failed(value, words):
+    test = {**SOLUTION["global_test"], "sigma0_squared": value, "passed": value == 1.0}
+    page = page_with(global_test=test)
+    assert words in page.content["quality"]["test"] and words in page.html
