@@ -8,11 +8,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import sweeps
-from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise
+from pipeline.estimation import gates, sweeps
+from pipeline.estimation.normal import cost_by_epoch, linearise
 from pipeline.estimation.parts import Part, bounds, part_of
-from pipeline.estimation.problem import Problem, Weights, keep_all, lengths, unchecked_statics
-from pipeline.estimation.residuals import sensor_residuals
+from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
 from pipeline.estimation.values import Values
 
 STRETCH = 64
@@ -27,10 +26,8 @@ in that measure, so it bounds every single one."""
 IRLS_STEPS = 2
 """First steps with re-weighting only: far from the optimum most corners are beyond the threshold, and without
 their curvature along the residual nothing would hold the step."""
-GATE = 3.0
-"""After Huber has converged, what is further off than this many times its threshold is no measurement: its weight
-becomes zero, and the rest is adjusted again. Gated from the start, a bad start would throw away good corners."""
 GATE_ROUNDS = 4
+"""Huber's optimum, the same without what is gross or doubtful, with what was doubted for nothing, and one to spare."""
 TRIES = 14
 KEPT_PARTS = 4
 HOLD = 1e12
@@ -58,12 +55,16 @@ def optimise(problem: Problem, huber: float, max_iterations: int) -> Optimum:
         The start cannot be evaluated.
     """
     values, weights = problem.first, keep_all(problem, huber)
+    aside: list[np.ndarray] = []
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
         values, used, converged, sigmas, cost = _iterate(problem, values, weights, limit)
         iterations += used
-        gated = gate(problem, values, weights)
+        gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
+        # Doubted once, at Huber's optimum; what no flip explains comes back for good.
+        aside = gates.doubtful(problem, fits) if round_ == 0 else gates.flipped(problem, values, aside)
+        gated = gates.without(gated, aside)
         same = all(np.array_equal(a, b) for a, b in zip(gated.corners, weights.corners, strict=True)) and all(
             np.array_equal(a, b) for a, b in zip(gated.sensors, weights.sensors, strict=True)
         )
@@ -71,25 +72,6 @@ def optimise(problem: Problem, huber: float, max_iterations: int) -> Optimum:
             break
         weights, converged = gated, False
     return Optimum(values, weights, iterations, converged, sigmas, cost)
-
-
-def gate(problem: Problem, values: Values, weights: Weights) -> Weights:
-    """Weights that leave out what is a gross outlier at these values."""
-    limit = GATE * weights.huber
-    corners: list[list[np.ndarray]] = [[] for _ in problem.corners]
-    sensors: list[list[np.ndarray]] = [[] for _ in problem.sensors]
-    for part in parts(problem, values, weights):
-        for rows, group in zip(corners, part.problem.corners, strict=True):
-            rows.append(corner_lengths(part.problem, part.values, group) <= limit)
-        for rows, readings in zip(sensors, part.problem.sensors, strict=True):
-            r, _ = sensor_residuals(readings, part.values, problem.statics, jacobians=False)
-            with np.errstate(invalid="ignore"):
-                rows.append(lengths(r, 1) <= limit)
-    return replace(
-        weights,
-        corners=tuple(map(np.concatenate, corners)),
-        sensors=tuple(map(np.concatenate, sensors)),
-    )
 
 
 def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
