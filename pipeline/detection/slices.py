@@ -19,7 +19,7 @@ from pipeline.config.site import DetectionSettings
 from pipeline.detection.acceptance import KnownTags, judge
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
-from pipeline.detection.decode import decode_grey
+from pipeline.detection.decode import Pictures, decode_grey
 from pipeline.detection.follow import Follower
 from pipeline.detection.motion import Thumbnails
 from pipeline.detection.refine import Refiner
@@ -82,6 +82,8 @@ class Finders:
         )
         self._decoder = WindowDecoder(settings)
         self._followers: dict[str, Follower] = {}
+        self.pictures = Pictures()
+        """For one span at a time."""
 
     def follower(self, camera: str) -> Follower:
         """Follows the tags in the frames of one camera."""
@@ -111,8 +113,9 @@ def search_slice(part: Slice, search: Search, reader: LogReader, finders: Finder
     for next_key, frames in zip(after, spans_of(part, reader)):
         # The key that ends a span begins the next one, and is counted and written there.
         pictures: list[tuple[int, int, np.ndarray]] = []
+        finders.pictures.begin()
         for number, frame in frames:
-            grey, outcome = _picture(frame, search.sizes[part.camera])
+            grey, outcome = _picture(frame, search.sizes[part.camera], finders.pictures)
             outcomes[outcome] += number != next_key
             if grey is not None:
                 pictures.append((number, frame.time_ns, grey))
@@ -146,9 +149,9 @@ def _follow(
     return follower.follow(greys, time_s, first, last), (pictures[-1][0], last)
 
 
-def _picture(frame: Frame, size: tuple[int, int]) -> tuple[np.ndarray | None, str]:
+def _picture(frame: Frame, size: tuple[int, int], room: Pictures) -> tuple[np.ndarray | None, str]:
     try:
-        grey = decode_grey(frame.data, frame.encoding, frame.width, frame.height)
+        grey = decode_grey(frame.data, frame.encoding, frame.width, frame.height, room)
     except DetectionError:
         return None, CORRUPT
     return (grey, SEARCHED) if grey.shape[::-1] == size else (None, WRONG_SIZE)

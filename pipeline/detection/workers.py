@@ -20,6 +20,7 @@ from concurrent.futures.process import BrokenProcessPool
 import cv2
 import numpy as np
 
+from pipeline.detection.motion import Thumbnails
 from pipeline.detection.refine import Refiner
 from pipeline.detection.slices import Finders, Search, give_up, is_whole, search_slice, undone, write_piece
 from pipeline.detection.spans import Slice
@@ -97,6 +98,7 @@ def warm_up(search: Search) -> None:
     bent = np.array([100.0, 100.0, 24.0, 24.0, 0.01, 0.0, 0.0, 0.0, 0.0])
     Refiner(bent).refine(grey, [family], [0], uv)
     locate(grey, [family], [0], uv[:, None], np.ones(1, int), np.ones(1))
+    Thumbnails(48, 48).of(grey)
 
 
 _ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from pipeline.detection.decode import decode_grey, picture_size
+from pipeline.detection.decode import Pictures, decode_grey, picture_size
 from pipeline.errors import DetectionError
 
 GREY = np.add.outer(np.arange(48), 2 * np.arange(64)).astype(np.uint8)
@@ -15,6 +15,20 @@ def test_every_encoding_gives_the_picture_upright():
     assert np.abs(decode_grey(JPEG, "jpeg").astype(int) - GREY).max() <= 6
     assert np.array_equal(decode_grey(PNG, "png"), GREY)
     assert np.array_equal(decode_grey(GREY.tobytes(), "raw", 64, 48), GREY)
+
+
+def test_pictures_of_a_span_have_memory_of_their_own_and_those_of_the_next_have_it_again():
+    other = simplejpeg.encode_jpeg(255 - GREY[..., None], quality=98, colorspace="GRAY")
+    room = Pictures()
+    first, second = (decode_grey(data, "jpeg", room=room) for data in (JPEG, other))
+    assert np.array_equal(first, decode_grey(JPEG, "jpeg")) and np.array_equal(
+        second, decode_grey(other, "jpeg")
+    )
+    room.begin()
+    again = decode_grey(other, "jpeg", room=room)
+    assert np.shares_memory(again, first) and np.array_equal(again, second)
+    wide = decode_grey(simplejpeg.encode_jpeg(GREY.T.copy()[..., None], colorspace="GRAY"), "jpeg", room=room)
+    assert wide.shape == GREY.T.shape and np.array_equal(again, second)
 
 
 def test_colour_jpeg_gives_its_luma():
