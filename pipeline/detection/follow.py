@@ -27,6 +27,7 @@ from pipeline.detection.prints import cells_across
 from pipeline.detection.refine import Refiner
 from pipeline.detection.seen import (
     NO_TRACK,
+    PIXELS_OF_FOLLOWED,
     SAME_SIDES,
     Seen,
     joined,
@@ -129,6 +130,10 @@ class Follower:
         """Every tag of a picture, refined."""
         return search(grey, self._finder, self._refiner)
 
+    def _glimpse(self, grey: np.ndarray, finder: TagFinder) -> Seen:
+        # As good as the frames beside it: with all their pixels nine tags take as long as the glance that finds them.
+        return search(grey, finder, self._refiner, PIXELS_OF_FOLLOWED)
+
     def follow(self, greys: Sequence[np.ndarray], time_s: np.ndarray, first: Seen, last: Seen) -> list[Seen]:
         """What is seen in each frame of a span; it depends on nothing but the arguments.
 
@@ -159,10 +164,10 @@ class Follower:
             if k == len(span) - 1:
                 self._take(span, k, last, tracks)
             elif _sweep_is_due(span, swept, k):
-                self._take(span, k, search(span.greys[k], self._sweeper, self._refiner), tracks)
+                self._take(span, k, self._glimpse(span.greys[k], self._sweeper), tracks)
                 swept = glanced = k
             elif _glance_is_due(span, glanced, k):
-                self._take(span, k, search(span.greys[k], self._glancer, self._refiner), tracks)
+                self._take(span, k, self._glimpse(span.greys[k], self._glancer), tracks)
                 glanced = k
             waiting = [track for track in tracks if track.frame != k]
             ended = _add(span, k, self._advance(span, k, waiting))

@@ -15,8 +15,8 @@ SEARCHED = "searched"
 FOLLOWED = "followed"
 NO_TRACK = -1
 PIXELS_OF_FOLLOWED = 500
-"""Of each followed tag. Its corners are then good to 0.02 to 0.03 px, below what repeats in every frame; all pixels
-would make that 0.008 to 0.015 px and take three times as long."""
+"""Of each tag between the keys. Its corners are then good to 0.02 to 0.03 px, below what repeats in every frame; all
+pixels would make that 0.008 to 0.015 px and take three times as long."""
 SAME_SIDES = 0.4
 """Two quads of one id whose centres are nearer than this part of their side are one tag."""
 
@@ -71,6 +71,7 @@ def seen_at(
     hamming: np.ndarray | None = None,
     margin: np.ndarray | None = None,
     track: Sequence[int] | None = None,
+    pixels: int = PIXELS_OF_FOLLOWED,
 ) -> Seen:
     """Tags near some places, refined; those with a decision margin were searched, the others followed.
 
@@ -88,10 +89,11 @@ def seen_at(
         What the decoder said.
     track : (n,) sequence, optional
         Their tracks.
+    pixels : int
+        As of `Refiner.refine`.
     """
     n = len(tag_id)
     uv = np.asarray(uv, float).reshape(-1, 4, 2)
-    pixels = PIXELS_OF_FOLLOWED if margin is None else ALL_PIXELS
     refined = refiner.refine(grey, list(family), [int(number) for number in tag_id], uv, pixels)
     stands = np.asarray(refined.reason == "", bool)[:, None, None]
     refined = replace(refined, uv=np.where(stands, refined.uv, uv), cov=np.where(stands, refined.cov, 0.0))
@@ -106,10 +108,23 @@ def seen_at(
     )
 
 
-def search(grey: np.ndarray, finder: TagFinder, refiner: Refiner) -> Seen:
-    """Every tag of a picture, refined; sorted by family, id and place."""
+def search(grey: np.ndarray, finder: TagFinder, refiner: Refiner, pixels: int = ALL_PIXELS) -> Seen:
+    """Every tag of a picture, refined with so many pixels; sorted by family, id and place."""
     found = finder.find(grey)
-    return joined([seen_at(grey, refiner, found.family, found.tag_id, found.uv, found.hamming, found.margin)])
+    return joined(
+        [
+            seen_at(
+                grey,
+                refiner,
+                found.family,
+                found.tag_id,
+                found.uv,
+                found.hamming,
+                found.margin,
+                pixels=pixels,
+            )
+        ]
+    )
 
 
 def joined(parts: Sequence[Seen]) -> Seen:
