@@ -162,12 +162,10 @@ def worst(problem: Problem, corner_fits: list[Fit]) -> list[dict]:
 def describe(problem: Problem, step: split.Step) -> dict:
     """A change in words and numbers."""
     network, time_ns, change = problem.network, problem.epochs.time_ns, step.change
-    known = len(network.statics)
-    # A second change of one static is that of its part after the first.
-    static = network.statics[step.static] if step.static < known else None
-    name = static.name if static is not None else "a quantity that had changed before"
+    static = network.statics[step.static]
+    name = static.name
     first, last = int(time_ns[change.first]), int(time_ns[change.last])
-    others = [network.statics[s].name for s in step.others if s < known]
+    others = [network.statics[s].name for s in step.others]
     amounts = amounts_of(step, static)
     plain = name.removesuffix(" pose").removesuffix(" mount")
     text = f"{plain} moved " + " and ".join(a["text"] for a in amounts)
@@ -199,7 +197,7 @@ def describe(problem: Problem, step: split.Step) -> dict:
 def amounts_of(step: split.Step, static) -> list[dict]:
     """How far, with one sigma along the way: millimetres and degrees of a pose, else component by component."""
     out = []
-    if len(step.shift) == 6 and (static is None or static.is_pose):
+    if static.is_pose:
         for part, factor, unit, digits in (
             (slice(0, 3), 1000.0, "mm", 1),
             (slice(3, 6), math.degrees(1.0), "deg", 3),
@@ -211,7 +209,6 @@ def amounts_of(step: split.Step, static) -> list[dict]:
                 out.append(_amount(size * factor, sigma * factor, unit, digits))
         if out:
             return out
-    assert static is not None
     sigma = np.sqrt(np.maximum(np.diagonal(step.cov), 0.0))
     k = int(np.argmax(np.abs(step.shift) / np.maximum(sigma, 1e-300)))
     if static.units[k] == "s":

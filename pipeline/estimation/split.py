@@ -25,6 +25,8 @@ FREE_TIMES = 30.0
 """The same for curves and offsets, as a multiple of their own prior."""
 MOST = 4
 """Changes that are looked for one after the other."""
+TRIES = 3 * MOST
+"""How often one of them is taken back at most; as a rule once each."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,8 +34,9 @@ class Step:
     """What a static did at a split, as the split adjustment measures it."""
 
     static: int
-    """The static before; ``after`` is the one after."""
+    """The static that changed; where it had changed before, that of the files."""
     after: int
+    """The one after."""
     change: changes.Change
     shift: np.ndarray
     """(n,) value after minus before; of a pose ``xi`` in its own frame, m and rad."""
@@ -198,10 +201,13 @@ def _ends(problem: Problem, group: Corners) -> tuple[str, str]:
 def trace(
     problem: Problem, optimum: Optimum, huber: float, max_iterations: int
 ) -> tuple[tuple[Step, ...], Problem, Optimum]:
-    """All changes of a log, the strongest first; each is split before the next is looked for.
+    """All changes of a log, in the order in which they were found.
 
-    One that moved pulls at all that see it, so only the strongest is believed, and the others are tested again without
-    it. The sizes are those of the last adjustment, in which all of them are free.
+    One that moved pulls at all that see it, so only the strongest is believed; it is split, and the others are tested
+    again without it. The first was chosen while the log was still bent by the rest: a benchmark that moved and a camera
+    that turned while nothing was seen, 15 s before, were first told as another benchmark. So where there are several,
+    each is taken back in turn, and what the log then tells in its place stands: the same, another one, or nothing.
+    The sizes are those of the last adjustment, in which all of them are free.
 
     Returns
     -------
@@ -209,25 +215,68 @@ def trace(
     problem, optimum : Problem, Optimum
         With every change split; the same as handed in where there is none.
     """
-    found: list[tuple[changes.Change, int, tuple[int, ...]]] = []
-    while len(found) < MOST:
-        change, others = changes.find(problem, optimum.values, huber)
+    last: tuple[list[_Found], tuple] = [], (problem, optimum, {})
+
+    def adjusted(found: list[_Found]) -> tuple[Problem, Optimum, dict[int, tuple[int, int]]]:
+        nonlocal last
+        if found != last[0]:
+            whole, places = _split_all(problem, optimum.values, found)
+            last = list(found), (whole, optimise(whole, huber, max_iterations), places)
+        return last[1]
+
+    def next_to(found: list[_Found]) -> _Found | None:
+        whole, at, places = adjusted(found)
+        change, others = changes.find(whole, at.values, huber)
         if change is None:
-            break
-        after = len(problem.network.statics)
-        problem, _ = split(problem, optimum.values, change.static, change.epoch, change.step)
-        optimum = optimise(problem, huber, max_iterations)
-        found.append((change, after, others))
+            return None
+        root = {after: found[i].static for i, (_, after) in places.items()}
+        return _Found(root.get(change.static, change.static), change, tuple(root.get(s, s) for s in others))
+
+    def all_next_to(found: list[_Found]) -> list[_Found]:
+        while len(found) < MOST and (new := next_to(found)):
+            found = [*found, new]
+        return found
+
+    found = all_next_to([])
+    sure = tries = 0
+    while sure < len(found) and tries < TRIES and (tries or len(found) > 1):
+        one, *rest = found
+        new, tries = next_to(rest), tries + 1
+        same = new is not None and new.static == one.static
+        sure = sure + 1 if same else 0
+        found = rest if new is None else [*rest, new] if same else all_next_to([*rest, new])
+    whole, at, places = adjusted(found)
     if not found:
-        return (), problem, optimum
-    chains, C, g_z = linearise(problem, optimum.values, optimum.weights)
+        return (), whole, at
+    chains, C, g_z = linearise(whole, at.values, at.weights)
     S = arrow.solve(chains, C, g_z).S
     P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
-    return tuple(_measure(problem, optimum.values, P_zz, *one) for one in found), problem, optimum
+    steps = (_measure(whole, at.values, P_zz, one, *places[i]) for i, one in enumerate(found))
+    return tuple(steps), whole, at
 
 
-def _measure(problem: Problem, values: Values, P_zz, change: changes.Change, after: int, others) -> Step:
-    statics, s = problem.statics, change.static
+@dataclass(frozen=True, eq=False)
+class _Found:
+    static: int
+    """Of the problem as it was handed in, also where a part of it changes that had changed before."""
+    change: changes.Change
+    others: tuple[int, ...]
+
+
+def _split_all(problem: Problem, values: Values, found: list[_Found]):
+    """The problem with all changes split, in order of time; and of each the statics before and after it."""
+    places: dict[int, tuple[int, int]] = {}
+    latest: dict[int, int] = {}
+    for i in sorted(range(len(found)), key=lambda i: found[i].change.epoch):
+        one = found[i]
+        before, after = latest.get(one.static, one.static), len(problem.network.statics)
+        problem, values = split(problem, values, before, one.change.epoch, one.change.step)
+        places[i], latest[one.static] = (before, after), after
+    return problem, places
+
+
+def _measure(problem: Problem, values: Values, P_zz, found: _Found, s: int, after: int) -> Step:
+    statics, change = problem.statics, found.change
     before_value, after_value = statics.value(s, values.z), statics.value(after, values.z)
     pose = statics.is_pose[s]
     shift = se3.local(before_value, after_value) if pose else after_value - before_value
@@ -235,4 +284,5 @@ def _measure(problem: Problem, values: Values, P_zz, change: changes.Change, aft
     J = np.zeros((len(shift), statics.size))
     J[:, statics.columns[after]] += statics.sensitivity(after, values.z)
     J[:, statics.columns[s]] -= statics.sensitivity(s, values.z)
-    return Step(s, after, change, shift, change.inflation * J @ P_zz @ J.T, others)
+    cov = change.inflation * J @ P_zz @ J.T
+    return Step(found.static, after, change, shift, cov, found.others)

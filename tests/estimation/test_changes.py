@@ -1,5 +1,7 @@
 """Changes in time, on corners drawn by another camera model: found, named, sized; and none where there is none."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,21 @@ def test_a_camera_that_turned_is_told_as_one_of_the_two_that_sit_on_the_cab(clea
     turn, sigma = np.linalg.norm(steps[0].shift[3:]), np.sqrt(np.trace(steps[0].cov[3:, 3:]))
     print(f"\nturned {np.rad2deg(turn):.4f} ± {np.rad2deg(sigma):.4f} deg")
     assert abs(turn - TURNED_RAD) < 3 * sigma and sigma < 0.2 * TURNED_RAD
+
+
+def test_two_changes_are_not_told_as_a_third():
+    """A camera turns while nothing is seen, and then a board moves: what explains both best alone is another board."""
+    drawn = inject(scene(1, 90.0), ["benchmark", "mount"], at_s=60.0).drawn  # the mount at 40 s
+    t = (drawn.observations.time_ns - T0_NS) * 1e-9
+    seen = drawn.observations.take(np.flatnonzero((t < 22) | (t >= 52)))
+    problem, (steps, _, _) = _trace(replace(drawn, observations=seen))
+    told = [(problem.network.statics[s.static].name, problem.epochs.time_s[s.change.epoch]) for s in steps]
+    print(f"\n{[f'{name} at {at:.1f} s' for name, at in told]}")
+    assert {name for name, _ in told} in (
+        {"benchmark B2 pose", "camera dig mount"},
+        {"benchmark B2 pose", "camera bench mount"},
+    )
+    assert dict(told)["benchmark B2 pose"] == pytest.approx(60.0, abs=0.5)
 
 
 @pytest.mark.parametrize("repeated_px", [0.0, 0.1])
