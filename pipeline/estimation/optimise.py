@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import gates, sweeps
+from pipeline.estimation import approach, gates, sweeps
 from pipeline.estimation.normal import cost_by_epoch, linearise
 from pipeline.estimation.parts import Part, bounds, part_of
 from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
@@ -21,13 +21,18 @@ DAMPING_FIRST, DAMPING_UP, DAMPING_DOWN, DAMPING_NONE = 1e-6, 30.0, 0.03, 1e-8
 """Shares of the diagonal. Nearly all of it is motion prior, which neighbouring epochs cancel: what holds a gap as a
 whole is a millionth of it."""
 STEP_SIGMAS = 0.05
-"""Converged when no unknown moves by more of its posterior sigma. ``-g' dx`` is the squared length of the whole step
-in that measure, so it bounds every single one."""
+"""Converged when no unknown moves by more of its posterior sigma; see ``sweeps.Reduced.longest``."""
+NEAR_STEPS = 3
+"""Steps of the states with the statics of a sample: 1e5, 500 and 10 sigmas, and 5 are left to the statics."""
 IRLS_STEPS = 2
 """First steps with re-weighting only: far from the optimum most corners are beyond the threshold, and without
 their curvature along the residual nothing would hold the step."""
 GATE_ROUNDS = 4
 """Huber's optimum, the same without what is gross or doubtful, with what was doubted for nothing, and one to spare."""
+PATIENCE = 0.05
+"""A whole step may raise the cost by this share of it, if the step after it is shorter; else it is taken back. A step
+of the statics alone bends the pictures of all epochs by a hundredth of a pixel. Over 100,000 epochs that sums up to a
+rise, which the next step mends; damping the states against it took 20 steps where this takes 2."""
 TRIES = 14
 KEPT_PARTS = 4
 HOLD = 1e12
@@ -46,8 +51,19 @@ class Optimum:
     cost: float
 
 
-def optimise(problem: Problem, huber: float, max_iterations: int) -> Optimum:
+def optimise(problem: Problem, huber: float, max_iterations: int, near=False) -> Optimum:
     """The states and statics that fit everything best.
+
+    Parameters
+    ----------
+    problem : Problem
+        With its start.
+    huber : float
+        Whitened length beyond which the loss grows linearly.
+    max_iterations : int
+        Steps of all unknowns together.
+    near : bool
+        The start is a few sigmas off: the optimum of other variances.
 
     Raises
     ------
@@ -56,22 +72,55 @@ def optimise(problem: Problem, huber: float, max_iterations: int) -> Optimum:
     """
     values, weights = problem.first, keep_all(problem, huber)
     aside: list[np.ndarray] = []
+    if not near:
+        values, near = _approached(problem, weights, max_iterations)
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
-        values, used, converged, sigmas, cost = _iterate(problem, values, weights, limit)
+        values, used, converged, sigmas, cost = _iterate(
+            problem, values, weights, limit, irls=0 if near or round_ else IRLS_STEPS
+        )
         iterations += used
         gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
         # Doubted once, at Huber's optimum; what no flip explains comes back for good.
         aside = gates.doubtful(problem, fits) if round_ == 0 else gates.flipped(problem, values, aside)
         gated = gates.without(gated, aside)
-        same = all(np.array_equal(a, b) for a, b in zip(gated.corners, weights.corners, strict=True)) and all(
-            np.array_equal(a, b) for a, b in zip(gated.sensors, weights.sensors, strict=True)
-        )
-        if same or not converged or iterations >= max_iterations or round_ == GATE_ROUNDS - 1:
+        if (
+            _same(gated, weights)
+            or not converged
+            or iterations >= max_iterations
+            or round_ == GATE_ROUNDS - 1
+        ):
             break
+        if round_ == 0:
+            huber_s = Optimum(values, weights, iterations, converged, sigmas, cost)
+        elif _same(gated, huber_s.weights):
+            # Nothing gross, and doubted for nothing: that optimum is known.
+            return replace(huber_s, iterations=iterations)
         weights, converged = gated, False
     return Optimum(values, weights, iterations, converged, sigmas, cost)
+
+
+def _same(a: Weights, b: Weights) -> bool:
+    pairs = [*zip(a.corners, b.corners, strict=True), *zip(a.sensors, b.sensors, strict=True)]
+    return all(np.array_equal(*pair) for pair in pairs)
+
+
+def _approached(problem: Problem, weights: Weights, max_iterations: int) -> tuple[Values, bool]:
+    """The start of a long log with the statics of a sample of it, and states that follow these; and whether it is."""
+    taken = approach.sample(problem, weights)
+    if taken is None:
+        return problem.first, False
+    short, of_short = taken
+    try:
+        found, _, converged, _, _ = _iterate(short, short.first, of_short, max_iterations, IRLS_STEPS)
+        if not converged:
+            return problem.first, False
+        states = approach.held(problem, found.z)
+        moved, *_ = _iterate(states, states.first, weights, NEAR_STEPS, IRLS_STEPS)
+    except EstimationError:
+        return problem.first, False  # what a sample cannot tell, the whole log may
+    return replace(moved, z=found.z), True
 
 
 def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
@@ -100,7 +149,7 @@ def pieces(
     return piece
 
 
-def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
+def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irls: int):
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
     damping = np.zeros(stretch[-1] + 1)
@@ -112,37 +161,51 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int):
         )
     held = unchecked_statics(problem)
     sigmas, converged, used = np.inf, False, 0
+    risky: _Risky | None = None
+    patient = True
     while used < limit and not converged:
         used += 1
-        step = _Step(problem, values, weights, held, newton=used > IRLS_STEPS)
+        step = _Step(problem, values, weights, held, newton=used > irls)
         shorten = 1.0
         for attempt in range(TRIES):
             step.solve(damping[stretch])
-            decrease = step.decrease
+            if risky is not None and step.longest > risky.longest:
+                break
+            risky, sigmas = None, step.longest
             trial = step.taken(shorten)
             trial_local, trial_prior = _cost(problem, trial, weights)
-            change = trial_local.sum() + trial_prior - local.sum() - prior
+            cost = local.sum() + prior
+            change = trial_local.sum() + trial_prior - cost
             rise = np.bincount(stretch, trial_local - local)
             # Rounding of the sum, and what re-weighting may cost, are no reason to damp.
-            if change <= 1e-10 * (local.sum() + prior) + 1e-9:
+            if change <= 1e-10 * cost + 1e-9:
+                patient = True
                 break
             risen = rise > max(0.02 * rise.max(), 1e-3)  # the stretches that spoil the step
+            if patient and attempt == 0 and change <= PATIENCE * cost:
+                risky = _Risky(values, local, prior, step.longest, risen)
+                break
             damping[risen] = np.maximum(damping[risen] * DAMPING_UP, DAMPING_FIRST)
             if attempt >= 3:
                 shorten *= 0.5
         else:
             # No step helps any more: at the bottom to rounding, or stuck, which the sigmas tell.
-            sigmas = np.sqrt(max(decrease, 0.0))
             return values, used, sigmas < STEP_SIGMAS, sigmas, local.sum() + prior
+        if risky is not None and values is not risky.values:
+            values, local, prior = risky.values, risky.local, risky.prior
+            damping[risky.risen] = np.maximum(damping[risky.risen] * DAMPING_UP, DAMPING_FIRST)
+            risky, patient = None, False
+            continue
         values = trial
         before = np.bincount(stretch, local)
         worse = rise > 0.1 * before + 10.0
         local, prior = trial_local, trial_prior
-        sigmas = np.sqrt(max(decrease, 0.0))
         converged = bool(sigmas < STEP_SIGMAS and shorten == 1.0 and np.all(damping < 1e-5))
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
         damping[worse] = np.maximum(damping[worse], DAMPING_FIRST)
+    if risky is not None and not converged:
+        values, local, prior = risky.values, risky.local, risky.prior
     return values, used, converged, sigmas, local.sum() + prior
 
 
@@ -150,6 +213,18 @@ def deltas_of(problem: Problem, dx) -> list[np.ndarray]:
     """Chain steps, cut up by variable."""
     places = [problem.place(k) for k in range(len(problem.tie.variables))]
     return [dx[c][:, at] for c, at in places]
+
+
+@dataclass(frozen=True, eq=False)
+class _Risky:
+    """Where a step began that raised the cost."""
+
+    values: Values
+    local: np.ndarray
+    prior: float
+    longest: float
+    risen: np.ndarray
+    """(stretches,) bool: where it rose."""
 
 
 class _Step:
@@ -184,7 +259,7 @@ class _Step:
                 "the normal equations of this log cannot be solved: measurements contradict each other beyond what "
                 "the stated sigmas allow, or a sigma in machine.toml or site.toml is wrong by orders of magnitude"
             )
-        self.dz, self.decrease = reduced.dz, reduced.decrease
+        self.dz, self.longest = reduced.dz, reduced.longest
         E = len(self.problem.epochs.time_ns)
         self.deltas = [np.empty((E, v.size)) for v in self.problem.tie.variables]
         for i, dx in sweeps.steps(self.pieces, reduced):

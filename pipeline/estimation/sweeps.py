@@ -60,10 +60,24 @@ class Reduced:
     """(p, p) information of the statics once the states are eliminated; its inverse is their covariance."""
     dz: np.ndarray
     """(p,) their step."""
-    decrease: float
-    """``-g' dx``, the squared length of the whole step in posterior sigmas."""
+    innovations: tuple[float, ...]
+    """Per part: ``sum |y_k|²`` of ``y = U^-T (-g)``, the squared length of the step that it asks of its states in
+    posterior sigmas, the statics held."""
+    pull: float
+    """The same of the statics, ``dz' S dz``. With the innovations it makes ``-g' dx``."""
     messages: tuple[tuple[Message, ...], ...]
     """Per part and chain."""
+
+    @property
+    def longest(self) -> float:
+        """What no unknown's step exceeds, in posterior sigmas.
+
+        A state moves by ``v' y - Y_k dz`` with ``|v|² = Z_kk``, and ``v`` lives on its own epoch and those after it for
+        as long as motion remembers: in its part and the one that follows. The length of the whole step would bound
+        it too, but grows with the root of the log's length.
+        """
+        two = np.convolve(self.innovations, np.ones(2))
+        return float(np.sqrt(max(two.max() + self.pull, 0.0)))
 
 
 def reduce(pieces: Pieces, count: int) -> Reduced:
@@ -83,7 +97,7 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
     """
     messages: list[tuple[Message, ...]] = []
     S = b = None
-    decrease = 0.0
+    innovations: list[float] = []
     for i in range(count):
         piece = pieces(i)
         if i == 0:
@@ -91,6 +105,7 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
             messages.append(tuple(_nothing(chain) for chain in piece.chains))
         S += piece.C
         b -= piece.g_z
+        innovations.append(0.0)
         following = []
         for chain, message in zip(piece.chains, messages[i], strict=True):
             W = np.concatenate([chain.B, -chain.g[..., None]], axis=-1)
@@ -101,14 +116,14 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
             square = blocks.gram(flat, flat)
             S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
             b[chain.columns] -= square[:-1, -1]
-            decrease += float(square[-1, -1])
+            innovations[-1] += float(square[-1, -1])
             if len(U) > piece.count:
                 following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
         messages.append(tuple(following))
     assert S is not None and b is not None
     S = 0.5 * (S + S.T)
     dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), b) if len(b) else b
-    return Reduced(S, dz, decrease + float(b @ dz), tuple(messages))
+    return Reduced(S, dz, tuple(innovations), float(b @ dz), tuple(messages))
 
 
 def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:

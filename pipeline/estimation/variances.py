@@ -66,8 +66,8 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
             near = True
         if (moved < SETTLED and near) or rounds == ROUNDS:
             break
-        at = optimise(trial, settings.huber, ROUND_STEPS)
-    at = optimise(trial, settings.huber, settings.max_iterations)
+        at = optimise(trial, settings.huber, ROUND_STEPS, near=True)
+    at = optimise(trial, settings.huber, settings.max_iterations, near=True)
     if not at.converged:
         return Settled(problem, optimum, repeated, tuple(start), 0)
     return Settled(trial, at, shares, tuple(densities), rounds)
