@@ -11,6 +11,7 @@ from pipeline.errors import EstimationError
 from pipeline.estimation import diagnostics, observability
 from pipeline.estimation.budget import correlation_time, epoch_classes, vertical_budgets
 from pipeline.estimation.densities import described
+from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.marginals import (
     BodyTrack,
     Marginals,
@@ -91,6 +92,10 @@ def adjust(
     solution = solution_of(settled.problem, settled.optimum, settings)
     solution.diagnostics["learned"] = {
         "rounds": settled.rounds,
+        "log_likelihood": [
+            *(round(value, 3) for value in settled.log_likelihood),
+            solution.diagnostics["log_likelihood"],
+        ],
         "motion": described(settled.problem, list(settled.densities)),
         "repeated": {
             "constant": round(settled.repeated.constant, 4),
@@ -169,6 +174,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
             v.body: problem.tie.frames.edges[fr.body_frame(v.body)].parent for v in problem.tie.variables
         },
         "cost": round(float(optimum.cost), 3),
+        "log_likelihood": round(log_likelihood(problem, optimum, found.log_det), 3),
         "global_test": whole,
         "corners": diagnostics.variance_component(corner_fits, settings.huber),
         "sensors": {

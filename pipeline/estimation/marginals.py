@@ -38,6 +38,8 @@ class Marginals:
     """(q,) per chain: statics behind the columns of Y."""
     P_zz: np.ndarray
     """(p, p) covariance of the statics' unknowns; their prior is the identity."""
+    log_det: float
+    """Of the whole log's normal matrix, in a part's marginals too."""
 
 
 def marginals_by_part(problem: Problem, values: Values, weights: Weights) -> Iterator[tuple[Part, Marginals]]:
@@ -67,6 +69,7 @@ def marginals_by_part(problem: Problem, values: Values, weights: Weights) -> Ite
                 tuple(f.Y for f in found),
                 columns,
                 P_zz,
+                reduced.log_det,
             ),
         )
 
@@ -81,6 +84,7 @@ def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
         tuple(np.concatenate([m.Y[c][: part.epochs] for part, m in found]) for c in chains),
         found[0][1].columns,
         found[0][1].P_zz,
+        found[0][1].log_det,
     )
 
 

@@ -67,6 +67,8 @@ class Reduced:
     """The same of the statics, ``dz' S dz``. With the innovations it makes ``-g' dx``."""
     messages: tuple[tuple[Message, ...], ...]
     """Per part and chain."""
+    log_det: float
+    """Of the whole normal matrix, states and statics, damping included."""
 
     @property
     def longest(self) -> float:
@@ -98,6 +100,7 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
     messages: list[tuple[Message, ...]] = []
     S = b = None
     innovations: list[float] = []
+    log_det = 0.0
     for i in range(count):
         piece = pieces(i)
         if i == 0:
@@ -117,13 +120,18 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
             S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
             b[chain.columns] -= square[:-1, -1]
             innovations[-1] += float(square[-1, -1])
+            log_det += 2 * float(np.sum(np.log(np.einsum("nii->ni", U[: piece.count]))))
             if len(U) > piece.count:
                 following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
         messages.append(tuple(following))
     assert S is not None and b is not None
     S = 0.5 * (S + S.T)
-    dz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), b) if len(b) else b
-    return Reduced(S, dz, tuple(innovations), float(b @ dz), tuple(messages))
+    dz = b
+    if len(b):
+        root = scipy.linalg.cho_factor(S)
+        dz = scipy.linalg.cho_solve(root, b)
+        log_det += 2 * float(np.sum(np.log(np.diagonal(root[0]))))
+    return Reduced(S, dz, tuple(innovations), float(b @ dz), tuple(messages), log_det)
 
 
 def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:

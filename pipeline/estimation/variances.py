@@ -14,6 +14,7 @@ from pipeline.config.site import EstimationSettings
 from pipeline.estimation import densities as motion_densities
 from pipeline.estimation import repeated as repeats
 from pipeline.estimation.densities import Densities
+from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, huber, lengths
@@ -38,6 +39,8 @@ class Settled:
     repeated: Repeated
     densities: tuple[Densities, ...]
     rounds: int
+    log_likelihood: tuple[float, ...]
+    """Before each round; see ``likelihood``."""
 
 
 def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, repeated: Repeated) -> Settled:
@@ -47,8 +50,10 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
     """
     densities = start = motion_densities.configured(problem, optimum.values)
     trial, at, shares, rounds = problem, optimum, repeated, 0
+    likely: list[float] = []
     for _ in range(ROUNDS):
         found = marginals(trial, at.values, at.weights)
+        likely.append(log_likelihood(trial, at, found.log_det))
         new = motion_densities.learned(trial, at.values, found, densities)
         told = told_by(trial, at, settings.huber) if repeated.resting > 0 else None
         moved = motion_densities.moved_by(densities, new)
@@ -69,8 +74,8 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
         at = optimise(trial, settings.huber, ROUND_STEPS, near=True)
     at = optimise(trial, settings.huber, settings.max_iterations, near=True)
     if not at.converged:
-        return Settled(problem, optimum, repeated, tuple(start), 0)
-    return Settled(trial, at, shares, tuple(densities), rounds)
+        return Settled(problem, optimum, repeated, tuple(start), 0, ())
+    return Settled(trial, at, shares, tuple(densities), rounds, tuple(likely))
 
 
 def told_by(problem: Problem, optimum: Optimum, k: float) -> Repeated | None:
