@@ -121,9 +121,9 @@ def _bodies(rng, network, by_name, scene, carried, t):
         if body.kind == "joint":
             angle, _ = simulator._turn(rng, np.deg2rad(centre), t, JOINT[1])
             angles[name] = angle
-            T_world[name] = T_world[needed] @ by_name[f"joint {name} axis"] @ simulator._rotz(angle)
+            T_world[name] = T_world[needed] @ by_name[f"joint {name} axis"] @ simulator.rotz(angle)
             continue
-        T_start = simulator._level(centre[:3])
+        T_start = simulator.level(centre[:3])
         T_carrier = se3.identity((len(t),))
         if camera is not None:
             T_carrier = T_world[needed] @ by_name[f"camera {camera.name} mount"]

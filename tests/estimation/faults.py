@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.config import Machine, Site
-from pipeline.geometry import linkage, se3, so3
+from pipeline.config.site import EstimationSettings, Split
+from pipeline.estimation import adjust
+from pipeline.geometry import se3, so3
 from pipeline.network import Observations, Readings, network_of
-from pipeline.network.model import Static
 from tests.estimation.simulator import (
     BUCKET_MARKER,
     MACHINE,
@@ -22,16 +23,21 @@ from tests.estimation.simulator import (
     SITE,
     T0_NS,
     Drawn,
-    _board,
-    _level,
-    _of,
-    _rotz,
+    board,
+    gross,
+    level,
+    marker_poses,
+    observed,
     picture,
+    pictures,
+    potentiometer,
+    rotz,
+    true_static,
 )
 
 FRAME_S = 0.2
 MOVED_M, TURNED_RAD, LATE_S = 0.010, np.deg2rad(0.05), 0.050
-BLIND_S = 60.0
+BLIND_S, MARGIN_S = 60.0, 1.0
 FAULTS = ("flips", "outliers", "benchmark", "mount", "offset", "blind", "dead", "duplicates")
 
 
@@ -50,7 +56,7 @@ def machine_at_work() -> dict:
 def site_with_four() -> dict:
     """site.toml of the scene."""
     document = copy.deepcopy(SITE)
-    document["benchmarks"]["B4"] = _board(9, [512_003.0, 4_123_009.5, 100.8], -5.0)
+    document["benchmarks"]["B4"] = board(9, [512_003.0, 4_123_009.5, 100.8], -5.0)
     return document
 
 
@@ -71,44 +77,32 @@ def scene(seed: int, seconds: float, repeated_px: float = 0.0) -> Drawn:
     rng = np.random.default_rng(seed)
     machine, site = Machine.model_validate(machine_at_work()), Site.model_validate(site_with_four())
     network = network_of(machine, site)
-    truth = [_drawn(rng, s) for s in network.statics]
+    truth = [true_static(rng, s) for s in network.statics]
     by_name = {s.name: value for s, value in zip(network.statics, truth, strict=True)}
     frame_ns = T0_NS + np.round(np.arange(int(seconds / FRAME_S)) * FRAME_S * 1e9).astype(np.int64)
     jitter = rng.uniform(0.2, 0.5, len(frame_ns)) * FRAME_S
     reading_ns = frame_ns + np.round(jitter * 1e9).astype(np.int64)
     time_ns = np.union1d(frame_ns, reading_ns)
     t = (time_ns - T0_NS) * 1e-9
-    T_cab = _level([0.0, 0.0, 1.5]) @ se3.exp(
+    T_cab = level([0.0, 0.0, 1.5]) @ se3.exp(
         _waves(rng, t, [0.04, 0.04, 0.02, 0.01, 0.01, 0.08], (7.0, 16.0))
     )
-    T_stick = _level([1.0, 6.0, 0.3]) @ se3.exp(
+    T_stick = level([1.0, 6.0, 0.3]) @ se3.exp(
         _waves(rng, t, [0.4, 0.4, 0.25, 0.15, 0.06, 0.06], (5.0, 12.0))
     )
     angle = np.deg2rad(-15.0) + _waves(rng, t, [0.15], (4.0, 9.0))[:, 0]
-    T_bucket = T_stick @ by_name["joint bucket axis"] @ _rotz(angle)
+    T_bucket = T_stick @ by_name["joint bucket axis"] @ rotz(angle)
     T_world = {
         "cab": T_cab,
         "stick": T_stick,
         "bucket": T_bucket,
         "tool": T_bucket @ by_name["cutting edge mount"],
     }
-    rows = np.searchsorted(time_ns, reading_ns)
-    params, (c0, c1) = by_name["sensor pot linkage"], by_name["sensor pot curve"]
-    raw = (linkage.cylinder_length(angle[rows], params, 1) - c0) / c1
-    assert np.all(np.isfinite(raw))
-    raw = raw + network.sensors[0].noise * rng.standard_normal(len(raw))
-    offset_ns = round(by_name["sensor pot time offset"][0] * 1e9)
+    pot = potentiometer(rng, network, by_name, reading_ns, angle[np.searchsorted(time_ns, reading_ns)])
     drawn = Drawn(
-        machine, site, network, None, {"pot": Readings(reading_ns - offset_ns, raw)},
-        time_ns, T_world, truth, angle, frame_ns,
+        machine, site, network, None, {"pot": pot}, time_ns, T_world, truth, angle, frame_ns
     )  # fmt: skip
     return replace(drawn, observations=_look(rng, drawn, repeated_px))
-
-
-def _drawn(rng, static: Static):
-    values, vectors = np.linalg.eigh(static.covariance)
-    error = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(values)))
-    return static.value @ se3.exp(error) if static.is_pose else static.value + error
 
 
 def _waves(rng, t, size, periods):
@@ -120,43 +114,26 @@ def _waves(rng, t, size, periods):
     return out
 
 
-def _poses(drawn: Drawn, c: int, k: int, rows):
-    """True ``T_camera_marker`` of a tag's marker at rows of the truth."""
-    by_name = {s.name: value for s, value in zip(drawn.network.statics, drawn.statics, strict=True)}
-    camera, marker = drawn.network.cameras[c], drawn.network.markers[drawn.network.tag_marker[k]]
-    name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
-    T_world_camera = _of(drawn.T_world, camera.body, rows) @ by_name[f"camera {camera.name} mount"]
-    return se3.inverse(T_world_camera) @ _of(drawn.T_world, marker.body, rows) @ by_name[name]
-
-
 def _look(rng, drawn: Drawn, repeated_px: float) -> Observations:
-    network = drawn.network
     rows = np.searchsorted(drawn.time_ns, drawn.frame_ns)
+    half, keep = repeated_px / np.sqrt(2), np.exp(-FRAME_S / 10.0)
+    repeats: dict[tuple[int, int], np.ndarray] = {}
     out = []
-    for c, camera in enumerate(network.cameras):
-        intrinsics = drawn.statics[camera.intrinsics]
-        for k in range(len(network.tag_marker)):
-            half = repeated_px / np.sqrt(2)
-            fixed, drift = half * rng.standard_normal((4, 2)), half * rng.standard_normal((4, 2))
-            keep = np.exp(-FRAME_S / 10.0)
-            for i, T in enumerate(_poses(drawn, c, k, rows)):
-                drift = keep * drift + np.sqrt(1 - keep**2) * half * rng.standard_normal((4, 2))
-                p = se3.transform(T, network.tag_corners[k])
-                if p[:, 2].min() < 0.5 or T[:3, 2] @ T[:3, 3] > -0.1 * np.linalg.norm(T[:3, 3]):
-                    continue
-                uv = picture(T, network.tag_corners[k], intrinsics)
-                if (uv < 5).any() or (uv > np.array([camera.width, camera.height]) - 5).any():
-                    continue
-                noise = SIGMA_PX * rng.standard_normal((4, 2))
-                out.append((c, k, drawn.frame_ns[i], uv + noise + fixed + drift))
-    n = len(out)
-    return Observations(
-        np.array([row[0] for row in out], dtype=np.int64),
-        np.array([row[1] for row in out], dtype=np.int64),
-        np.array([row[2] for row in out], dtype=np.int64),
-        np.array([row[3] for row in out]).reshape(n, 4, 2),
-        np.broadcast_to((SIGMA_PX**2 + repeated_px**2) * np.eye(2), (n, 4, 2, 2)).copy(),
-    )
+    for c, k, i, uv in pictures(drawn.network, drawn.by_name, drawn.T_world, rows):
+        if (c, k) not in repeats:
+            drift = rng.standard_normal((len(rows), 4, 2))
+            for j in range(1, len(rows)):
+                drift[j] = keep * drift[j - 1] + np.sqrt(1 - keep**2) * drift[j]
+            repeats[c, k] = half * (rng.standard_normal((4, 2)) + drift)
+        uv = uv + repeats[c, k][i] + SIGMA_PX * rng.standard_normal((4, 2))
+        out.append((c, k, drawn.frame_ns[i], uv))
+    return observed(out, SIGMA_PX**2 + repeated_px**2)
+
+
+def _pose(drawn: Drawn, seen: Observations, i: int):
+    """True ``T_camera_marker`` of a sighting."""
+    row = np.searchsorted(drawn.time_ns, seen.time_ns[i : i + 1])
+    return marker_poses(drawn.network, drawn.by_name, drawn.T_world, seen.camera[i], seen.tag[i], row)[0]
 
 
 @dataclass(frozen=True)
@@ -167,8 +144,39 @@ class Injected:
     steps: dict[str, tuple[float, float]]
     gaps: tuple[tuple[float, float], ...]
 
+    def outside(self) -> np.ndarray:
+        """(F,) bool: frames that are not in a gap, nor within a second of one."""
+        t = (self.drawn.frame_ns - T0_NS) * 1e-9
+        keep = np.ones(len(t), dtype=bool)
+        for low, high in self.gaps:
+            keep &= (t < low - MARGIN_S) | (t > high + MARGIN_S)
+        return keep
 
-def inject(drawn: Drawn, faults, seed: int = 0, at_s: float | None = None) -> Injected:
+
+def edge_error(drawn: Drawn, settings: EstimationSettings):
+    """Error of the cutting edge's middle by frame, (F, 3) with nan where there is none; and the solution."""
+    solution = adjust(drawn.network, drawn.observations, drawn.readings, settings)
+    tool = solution.body("tool")
+    error, rows = drawn.error(tool)
+    out = np.full((len(drawn.frame_ns), 3), np.nan)
+    out[np.searchsorted(drawn.frame_ns, tool.time_ns[rows])] = error[:, :3]
+    return out, solution
+
+
+def rmse(error, rows) -> float:
+    """Root mean square length of the errors (F, 3) at some frames (F,) bool."""
+    return float(np.sqrt(np.nanmean(np.sum(error[rows] ** 2, axis=1))))
+
+
+def told(change: dict) -> Split:
+    """What the sentence of a change asks to write into site.toml."""
+    at = np.datetime64(change["at_ns"], "ns").astype("datetime64[ms]").item()
+    return Split.model_validate({"static": change["static"], "at": f"{at.isoformat()}Z"})
+
+
+def inject(
+    drawn: Drawn, faults, seed: int = 0, at_s: float | None = None, blind_s: float = BLIND_S
+) -> Injected:
     """The log with faults.
 
     Parameters
@@ -180,7 +188,10 @@ def inject(drawn: Drawn, faults, seed: int = 0, at_s: float | None = None) -> In
     seed : int
         Of the draws.
     at_s : float, optional
-        When the benchmark, the mount and the clock change; the default is 60 s before the end.
+        When the benchmark moves; the mount turns 20 s and the clock is set 10 s before. The default is 60 s before the
+        end.
+    blind_s : float
+        How long no camera sees anything.
     """
     rng = np.random.default_rng(seed)
     network, readings = drawn.network, dict(drawn.readings)
@@ -214,14 +225,12 @@ def inject(drawn: Drawn, faults, seed: int = 0, at_s: float | None = None) -> In
         for i in np.flatnonzero(rng.random(len(uv)) < 0.05):
             uv[i] = _flipped(drawn, seen, i, uv[i])
     if "outliers" in faults:
-        bad = rng.random(uv.shape[:2]) < 0.05
-        angle, size = rng.uniform(0, 2 * np.pi, bad.shape), rng.uniform(3, 20, bad.shape)
-        uv += (bad * size)[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+        uv += gross(rng, uv.shape[:2], 0.05)
     keep = np.ones(len(uv), dtype=bool)
     if "blind" in faults:
         start = 0.25 * end
-        keep &= (t < start) | (t >= start + BLIND_S)
-        gaps.append((start, start + BLIND_S))
+        keep &= (t < start) | (t >= start + blind_s)
+        gaps.append((start, start + blind_s))
     if "dead" in faults:
         keep &= (seen.camera != 0) | (t < 0.5 * end)
     rows = np.flatnonzero(keep)
@@ -239,9 +248,7 @@ def _shift(drawn: Drawn, seen: Observations, rows, before=None, after=None):
     before, after = (np.eye(4) if T is None else T for T in (before, after))
     out = np.zeros_like(seen.uv)
     for i in rows:
-        c, k = seen.camera[i], seen.tag[i]
-        row = np.searchsorted(drawn.time_ns, seen.time_ns[i])
-        T = _poses(drawn, c, k, np.array([row]))[0]
+        c, k, T = seen.camera[i], seen.tag[i], _pose(drawn, seen, i)
         p, K = drawn.network.tag_corners[k], drawn.statics[drawn.network.cameras[c].intrinsics]
         out[i] = picture(before @ T @ after, p, K) - picture(T, p, K)
     return out
@@ -250,8 +257,7 @@ def _shift(drawn: Drawn, seen: Observations, rows, before=None, after=None):
 def _flipped(drawn: Drawn, seen: Observations, i: int, uv):
     """Corners of the tag's other planar pose: what a detector that chose the wrong branch would follow."""
     k, K = seen.tag[i], drawn.statics[drawn.network.cameras[seen.camera[i]].intrinsics]
-    row = np.searchsorted(drawn.time_ns, seen.time_ns[i])
-    T = _poses(drawn, seen.camera[i], k, np.array([row]))[0]
+    T = _pose(drawn, seen, i)
     p = drawn.network.tag_corners[k]
     centre, n = T[:3, :3] @ p.mean(axis=0) + T[:3, 3], T[:3, 2]
     ray = centre / np.linalg.norm(centre)

@@ -16,6 +16,7 @@ import numpy as np
 from pipeline.config import Machine, Site
 from pipeline.geometry import linkage, se3, so3
 from pipeline.network import Network, Observations, Readings, network_of
+from pipeline.network.model import Static
 
 T0_NS = 1_700_000_000_000_000_000
 SIGMA_PX = 0.2
@@ -139,7 +140,7 @@ BUCKET_MARKER = {
 }
 
 
-def _board(first_id, enh, yaw):
+def board(first_id, enh, yaw):
     tags = [
         {"id": first_id + k, "size_m": 0.35, "x_m": x, "y_m": y}
         for k, (x, y) in enumerate([(-0.25, 0.25), (0.25, 0.25), (0.0, -0.25)])
@@ -153,9 +154,9 @@ SITE = {
     "site": {"id": "sim"},
     "grid": {"unit": "m", "origin": [512_000, 4_123_000, 100]},
     "benchmarks": {
-        "B1": _board(0, [511_997.5, 4_123_009.0, 101.2], 25.0),
-        "B2": _board(3, [512_001.5, 4_123_010.0, 101.5], -30.0),
-        "B3": _board(6, [511_999.5, 4_123_012.0, 103.4], 20.0),
+        "B1": board(0, [511_997.5, 4_123_009.0, 101.2], 25.0),
+        "B2": board(3, [512_001.5, 4_123_010.0, 101.5], -30.0),
+        "B3": board(6, [511_999.5, 4_123_012.0, 103.4], 20.0),
     },
     "alignment": {"points": [[512_000.0, 4_123_000.0], [512_000.0, 4_123_010.0]]},
     "design": {"file": "design.csv", "kind": "profile_csv"},
@@ -211,6 +212,11 @@ class Drawn:
         truth = self.T_world[states.body][np.searchsorted(self.time_ns, states.time_ns[rows])]
         return se3.local(states.T_world_body[rows], truth), rows
 
+    @property
+    def by_name(self) -> dict[str, np.ndarray]:
+        """True value of every static by its name."""
+        return {s.name: value for s, value in zip(self.network.statics, self.statics, strict=True)}
+
 
 def exact(document):
     """The same file with every sigma of a static set to zero."""
@@ -235,11 +241,7 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
         document.pop("sensors", None)
     machine, site = Machine.model_validate(document), Site.model_validate(o.site)
     network = network_of(machine, site)
-    truth = []
-    for static in network.statics:
-        values, vectors = np.linalg.eigh(static.covariance)
-        error = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(values)))
-        truth.append(static.value @ se3.exp(error) if static.is_pose else static.value + error)
+    truth = [true_static(rng, static) for static in network.statics]
     by_name = {s.name: value for s, value in zip(network.statics, truth, strict=True)}
 
     frame_ns = T0_NS + np.round(np.arange(o.epochs) * o.frame_s * 1e9).astype(np.int64)
@@ -249,20 +251,17 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
         # Not in step with the frames: a jitter of up to a third of the interval.
         jitter = rng.uniform(0.2, 0.5, count) * o.reading_s
         reading_ns = T0_NS + np.round((np.arange(count) * o.reading_s + jitter) * 1e9).astype(np.int64)
-        offset_ns = round(by_name["sensor pot time offset"][0] * 1e9)
-    else:
-        offset_ns = 0
     time_ns = np.union1d(frame_ns, reading_ns)
     t = (time_ns - T0_NS) * 1e-9
     motion = {name: machine.motion[name] for name in ("cab", "stick", "bucket")}
-    T_cab = _wander(rng, _level([0.0, 0.0, 1.5]), t, motion["cab"])
-    T_dig_stick0 = se3.inverse(_level([0.0, 0.0, 1.5]) @ machine.cameras["dig"].mount.transform()) @ _level(
+    T_cab = _wander(rng, level([0.0, 0.0, 1.5]), t, motion["cab"])
+    T_dig_stick0 = se3.inverse(level([0.0, 0.0, 1.5]) @ machine.cameras["dig"].mount.transform()) @ level(
         [1.0, 6.0, 0.3]
     )
     T_camera_stick = _wander(rng, T_dig_stick0, t, motion["stick"])
     T_stick = T_cab @ by_name["camera dig mount"] @ T_camera_stick
     angle, _rate = _turn(rng, np.deg2rad(-15.0), t, motion["bucket"].rotation)
-    T_bucket = T_stick @ by_name["joint bucket axis"] @ _rotz(angle)
+    T_bucket = T_stick @ by_name["joint bucket axis"] @ rotz(angle)
     T_world = {
         "cab": T_cab,
         "stick": T_stick,
@@ -276,56 +275,81 @@ def draw(seed: int, options: Options | None = None) -> Drawn:
 
     readings = {}
     if network.sensors:
-        rows = np.searchsorted(time_ns, reading_ns)
-        # The stamp is earlier than the truth by the offset; the nominal one is in the file.
-        params, (c0, c1) = by_name["sensor pot linkage"], by_name["sensor pot curve"]
-        raw = (linkage.cylinder_length(angle[rows], params, 1) - c0) / c1
-        assert np.all(np.isfinite(raw))
-        raw = raw + network.sensors[0].noise * rng.standard_normal(len(raw))
-        readings["pot"] = Readings(reading_ns - offset_ns, raw)
+        turned = angle[np.searchsorted(time_ns, reading_ns)]
+        readings["pot"] = potentiometer(rng, network, by_name, reading_ns, turned)
     observations = _look(rng, network, by_name, T_world, time_ns, frame_ns, o)
     return Drawn(machine, site, network, observations, readings, time_ns, T_world, truth, angle, frame_ns)
 
 
-def _look(rng, network, by_name, T_world, time_ns, frame_ns, o) -> Observations:
-    rows = np.searchsorted(time_ns, frame_ns)
-    blind = np.zeros(len(rows), dtype=bool)
-    for low, high in o.blind:
-        blind |= (o.frame_s * np.arange(len(rows)) >= low) & (o.frame_s * np.arange(len(rows)) < high)
-    out = []
+def true_static(rng, static: Static):
+    """A draw from what the file says of a static."""
+    values, vectors = np.linalg.eigh(static.covariance)
+    error = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.standard_normal(len(values)))
+    return static.value @ se3.exp(error) if static.is_pose else static.value + error
+
+
+def potentiometer(rng, network: Network, by_name, reading_ns, angle) -> Readings:
+    """Raw readings of the cylinder at true instants and angles (n,), stamped as the sensor would."""
+    params, (c0, c1) = by_name["sensor pot linkage"], by_name["sensor pot curve"]
+    raw = (linkage.cylinder_length(angle, params, 1) - c0) / c1
+    assert np.all(np.isfinite(raw))
+    raw = raw + network.sensors[0].noise * rng.standard_normal(len(raw))
+    # The stamp is earlier than the truth by the offset; the nominal one is in the file.
+    return Readings(reading_ns - round(by_name["sensor pot time offset"][0] * 1e9), raw)
+
+
+def marker_poses(network: Network, by_name, T_world, c: int, k: int, rows):
+    """True ``T_camera_marker`` of a tag's marker at rows of the truth, (n, 4, 4)."""
+    camera, marker = network.cameras[c], network.markers[network.tag_marker[k]]
+    name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
+    T_world_camera = _of(T_world, camera.body, rows) @ by_name[f"camera {camera.name} mount"]
+    return se3.inverse(T_world_camera) @ _of(T_world, marker.body, rows) @ by_name[name]
+
+
+def pictures(network: Network, by_name, T_world, rows):
+    """Every tag that a camera sees from its printed side, without noise: camera, tag, place in ``rows``, (4, 2) px."""
     for c, camera in enumerate(network.cameras):
-        T_world_camera = _of(T_world, camera.body, rows) @ by_name[f"camera {camera.name} mount"]
         intrinsics = by_name[f"camera {camera.name} intrinsics"]
-        for k, m in enumerate(network.tag_marker):
-            marker = network.markers[m]
-            name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
-            T_camera_marker = se3.inverse(T_world_camera) @ _of(T_world, marker.body, rows) @ by_name[name]
-            kept: dict[str, np.ndarray] = {}
-            for i, T in enumerate(T_camera_marker):
-                if marker.benchmark and blind[i]:
+        for k in range(len(network.tag_marker)):
+            for i, T in enumerate(marker_poses(network, by_name, T_world, c, k, rows)):
+                p = se3.transform(T, network.tag_corners[k])
+                if p[:, 2].min() < 0.5 or T[:3, 2] @ T[:3, 3] > -0.1 * np.linalg.norm(T[:3, 3]):
                     continue
                 uv = picture(T, network.tag_corners[k], intrinsics)
-                inside = (
-                    (uv > 5).all()
-                    and (uv[:, 0] < camera.width - 5).all()
-                    and (uv[:, 1] < camera.height - 5).all()
-                )
-                p = se3.transform(T, network.tag_corners[k])
-                if not inside or p[:, 2].min() < 0.5 or T[:3, 2] @ T[:3, 3] > -0.1 * np.linalg.norm(T[:3, 3]):
-                    continue
-                uv = uv + SIGMA_PX * _noise(rng, uv, kept, o)
-                bad = rng.random(4) < o.outliers
-                away = rng.uniform(0, 2 * np.pi, 4)
-                uv += (bad * rng.uniform(3, 20, 4))[:, None] * np.stack([np.cos(away), np.sin(away)], axis=-1)
-                out.append((c, k, frame_ns[i], uv))
-    n = len(out)
+                if (uv > 5).all() and (uv < np.array([camera.width, camera.height]) - 5).all():
+                    yield c, k, i, uv
+
+
+def observed(rows, variance_px2: float) -> Observations:
+    """Observations from rows of camera, tag, stamp and (4, 2) corners."""
+    n = len(rows)
     return Observations(
-        np.array([row[0] for row in out], dtype=np.int64),
-        np.array([row[1] for row in out], dtype=np.int64),
-        np.array([row[2] for row in out], dtype=np.int64),
-        np.array([row[3] for row in out]).reshape(n, 4, 2),
-        np.broadcast_to(SIGMA_PX**2 * np.eye(2), (n, 4, 2, 2)).copy(),
+        *(np.array([row[j] for row in rows], dtype=np.int64) for j in range(3)),
+        np.array([row[3] for row in rows]).reshape(n, 4, 2),
+        np.broadcast_to(variance_px2 * np.eye(2), (n, 4, 2, 2)).copy(),
     )
+
+
+def _look(rng, network, by_name, T_world, time_ns, frame_ns, o) -> Observations:
+    blind = np.zeros(len(frame_ns), dtype=bool)
+    for low, high in o.blind:
+        t = o.frame_s * np.arange(len(frame_ns))
+        blind |= (t >= low) & (t < high)
+    out = []
+    kept: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+    for c, k, i, uv in pictures(network, by_name, T_world, np.searchsorted(time_ns, frame_ns)):
+        if network.markers[network.tag_marker[k]].benchmark and blind[i]:
+            continue
+        uv = uv + SIGMA_PX * _noise(rng, uv, kept.setdefault((c, k), {}), o)
+        out.append((c, k, frame_ns[i], uv + gross(rng, (4,), o.outliers)))
+    return observed(out, SIGMA_PX**2)
+
+
+def gross(rng, shape, share: float):
+    """By how much corners are off, (*shape, 2): that share of them by 3 to 20 px."""
+    bad, away = rng.random(shape) < share, rng.uniform(0, 2 * np.pi, shape)
+    size = bad * rng.uniform(3, 20, shape)
+    return size[..., None] * np.stack([np.cos(away), np.sin(away)], axis=-1)
 
 
 def _noise(rng, uv, kept, o):
@@ -353,11 +377,11 @@ def _of(T_world, body, rows):
     return se3.identity((len(rows),)) if body == "world" else T_world[body][rows]
 
 
-def _level(xyz):
+def level(xyz):
     return se3.from_rotation_translation(np.eye(3), np.array(xyz))
 
 
-def _rotz(angle):
+def rotz(angle):
     return se3.from_rotation_translation(so3.exp(angle[:, None] * np.array([0, 0, 1.0])), np.zeros(3))
 
 
