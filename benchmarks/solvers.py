@@ -15,7 +15,8 @@ of the processor's seconds and of memory; where a limit struck, what was done by
 Costs are compared by both functions at both answers: ours at GTSAM's, and GTSAM's factors at ours and at its own.
 
 Bars: costs equal to 1e-7; covariances equal to 1e-7 of their sigmas at the same values; at 10,000 epochs at least 5
-times faster than GTSAM to the optimum and all marginals; and at 100,000 to the end, where GTSAM is not.
+times faster than GTSAM to the optimum and all marginals; at 100,000 within 3 minutes and 2 GB, which is what the whole
+adjustment may take for three times as many epochs, and where GTSAM is not done.
 """
 
 from __future__ import annotations
@@ -36,14 +37,16 @@ from benchmarks._two_carriers import NO_LOSS, problem_of_two
 from pipeline.estimation import arrow
 from pipeline.estimation.marginals import marginals, marginals_by_part
 from pipeline.estimation.normal import cost_by_epoch, linearise
-from pipeline.estimation.optimise import _iterate, deltas_of
+from pipeline.estimation.optimise import IRLS_STEPS, _approached, _iterate, deltas_of
 from pipeline.estimation.problem import Problem, keep_all
 from pipeline.estimation.values import Values
 from pipeline.geometry import se3
 
 LENGTHS = (1_000, 10_000, 100_000)
-LIMIT_S, LIMIT_GB = 600, 8
+LIMIT_S, LIMIT_GB = 600, 16
 COST_BAR, COVARIANCE_BAR, FASTER_BAR = 1e-7, 1e-7, 5.0
+BUDGET_S, BUDGET_MB = 180.0, 2000.0
+"""Of the processor; what GTSAM is held against at the longest."""
 
 
 @dataclass
@@ -83,7 +86,11 @@ def our_cost(problem: Problem, values: Values) -> float:
 
 def plain_optimum(problem: Problem) -> tuple[Values, int]:
     """Where our solver ends without its gates, and after how many iterations: they are no part of the problem."""
-    values, iterations, converged, _, _ = _iterate(problem, problem.first, keep_all(problem, NO_LOSS), 50)
+    weights = keep_all(problem, NO_LOSS)
+    values, near = _approached(problem, weights, 50)
+    values, iterations, converged, _, _ = _iterate(
+        problem, values, weights, 50, irls=0 if near else IRLS_STEPS
+    )
     assert converged
     return values, iterations
 
@@ -247,6 +254,13 @@ def one(way: str, epochs: int, limit_s: int, limit_gb: int) -> None:
     RUNS[way](problem)
 
 
+def within_budget(row: Row | None) -> bool:
+    """Whether it got to the end with what the adjustment of a shift may take."""
+    if row is None or row.seconds is None or row.megabytes is None:
+        return False
+    return row.seconds <= BUDGET_S and row.megabytes <= BUDGET_MB
+
+
 def missed_bars(rows: list[Row]) -> list[str]:
     """What does not hold."""
     at = {(row.epochs, row.way): row for row in rows}
@@ -273,6 +287,11 @@ def missed_bars(rows: list[Row]) -> list[str]:
             missed.append(f"{epochs} epochs: ours did not finish")
         elif other.seconds is not None and other.seconds < FASTER_BAR * ours.seconds:
             missed.append(f"{epochs} epochs: only {other.seconds / ours.seconds:.1f} times faster")
+    if (LENGTHS[-1], "gtsam") in at:
+        if not within_budget(at.get((LENGTHS[-1], "ours"))):
+            missed.append(f"{LENGTHS[-1]} epochs: ours beyond {BUDGET_S:.0f} s or {BUDGET_MB:.0f} MB")
+        if within_budget(at[LENGTHS[-1], "gtsam"]):
+            missed.append(f"{LENGTHS[-1]} epochs: GTSAM finishes too")
     return list(dict.fromkeys(missed))
 
 
@@ -328,8 +347,9 @@ def main() -> int:
     for epochs in sorted({row.epochs for row in rows}):
         ours, other = at.get((epochs, "ours")), at.get((epochs, "gtsam"))
         if ours and other and ours.seconds:
-            times = other.ended or (f"{other.seconds / ours.seconds:.0f} times" if other.seconds else "")
-            parts.append(f"{epochs} epochs {ours.seconds:.1f} s, GTSAM {times}")
+            times = other.ended or (f"{other.seconds / ours.seconds:.1f} times" if other.seconds else "")
+            memory = f", {ours.megabytes:.0f} and {other.megabytes:.0f} MB" if other.megabytes else ""
+            parts.append(f"{epochs} epochs {ours.seconds:.1f} s, GTSAM {times}{memory}")
     line = f"solvers: {'; '.join(parts)}" + (f"; MISSED: {', '.join(missed)}" if missed else "")
     keep_result("solvers", [asdict(row) | {"seconds": row.seconds} for row in rows], line)
     print(line)
