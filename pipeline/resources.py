@@ -14,7 +14,7 @@ _root = _package / "_data" if (_package / "_data").is_dir() else _package.parent
 
 
 def schema_folder() -> Path:
-    """The folder of schemas: ``config/``, ``channels/`` and ``tables/``."""
+    """The folder of schemas: ``config/``, ``channels/``, ``tables/`` and ``artefacts/``."""
     return _root / "schemas"
 
 
