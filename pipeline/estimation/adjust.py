@@ -10,7 +10,7 @@ from pipeline.config.site import EstimationSettings
 from pipeline.errors import EstimationError
 from pipeline.estimation import diagnostics, observability
 from pipeline.estimation.budget import correlation_time, epoch_classes, vertical_budgets
-from pipeline.estimation.densities import described
+from pipeline.estimation.densities import described, spells
 from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.marginals import (
     BodyTrack,
@@ -97,6 +97,7 @@ def adjust(
             solution.diagnostics["log_likelihood"],
         ],
         "motion": described(settled.problem, list(settled.densities)),
+        "spells": spells(settled.problem, list(settled.densities)),
         "repeated": {
             "constant": round(settled.repeated.constant, 4),
             "resting": round(settled.repeated.resting, 4),

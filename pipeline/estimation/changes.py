@@ -153,33 +153,57 @@ def log_chance(T: float, r: int, K: int) -> float:
     return min(0.0, density + math.log((1 - r / T) * span + 2 / T))
 
 
+@dataclass(frozen=True, eq=False)
+class Peak:
+    """The best step of one static, whether or not chance explains it."""
+
+    T: np.ndarray
+    """(K,) by candidate instant, under white noise."""
+    at: int
+    """The candidate at which it is largest."""
+    step: np.ndarray
+    cov: np.ndarray
+    """Of the step, under white noise."""
+    inflation: float
+    log_p: float
+    """See ``Change``."""
+
+
+def peak(found: Sums, static: int) -> Peak:
+    """The step of a static that explains most, and how likely it is without a change."""
+    columns, K = found.rows[static], len(found.at)
+    T = np.array([0.0] + [step_of(found, columns, j)[2] for j in range(1, K)])
+    j = int(np.argmax(T))
+    step, cov, _ = step_of(found, columns, j)
+    f, dof = inflation(found, columns, j, step)
+    log_p = log_chance(like_chi_square(T[j] / f, len(columns), dof), len(columns), K)
+    return Peak(T, j, step, cov, f, log_p)
+
+
 def strongest(problem: Problem, found: Sums) -> tuple[Change | None, tuple[int, ...]]:
     """The change that explains most, if no chance does, and the statics that explain it as well or nearly."""
-    K, best = len(found.at), None
+    K = len(found.at)
     if K < FEWEST:
         return None, ()
-    peaks: dict[int, np.ndarray] = {}
-    for s, columns in found.rows.items():
-        T = np.array([0.0] + [step_of(found, columns, j)[2] for j in range(1, K)])
-        peaks[s] = T
-        j = int(np.argmax(T))
-        # Which of them it was, T itself tells: they are rival explanations of the same residuals, and the inflation
-        # of each is known to a factor of two at best.
-        if best is not None and T[j] < best.statistic * best.inflation:
-            continue
-        step, cov, _ = step_of(found, columns, j)
-        f, dof = inflation(found, columns, j, step)
-        log_p = log_chance(like_chi_square(T[j] / f, len(columns), dof), len(columns), K)
-        if log_p < math.log(FALSE_ALARM) and not is_small(problem, s, step):
-            # T falls by INSTANT f where the instant leaves its 95 % interval.
-            near = np.flatnonzero(T[j] - T < INSTANT * f)
-            first, last = int(found.at[max(near[0] - 1, 0)]), int(found.at[min(near[-1] + 1, K - 1)])
-            best = Change(s, int(found.at[j]), first, last, step, f * cov, float(T[j] / f), log_p, f)
-    if best is None:
+    peaks = {s: peak(found, s) for s in found.rows}
+    named = [
+        s
+        for s, one in peaks.items()
+        if one.log_p < math.log(FALSE_ALARM) and not is_small(problem, s, one.step)
+    ]
+    if not named:
         return None, ()
-    j = int(np.searchsorted(found.at, best.epoch))
-    bar = peaks[best.static][j] * (1 - ALIKE)
-    return best, tuple(s for s, T in peaks.items() if s != best.static and T[j] > bar)
+    # Which of them it was, T itself tells: they are rival explanations of the same residuals, and the inflation of each
+    # is known to a factor of two at best.
+    s = max(named, key=lambda s: peaks[s].T.max())
+    best = peaks[s]
+    top, f = float(best.T[best.at]), best.inflation
+    # T falls by INSTANT f where the instant leaves its 95 % interval.
+    near = np.flatnonzero(top - best.T < INSTANT * f)
+    first, last = int(found.at[max(near[0] - 1, 0)]), int(found.at[min(near[-1] + 1, K - 1)])
+    change = Change(s, int(found.at[best.at]), first, last, best.step, f * best.cov, top / f, best.log_p, f)
+    rivals = (r for r, one in peaks.items() if r != s and one.T[best.at] > top * (1 - ALIKE))
+    return change, tuple(rivals)
 
 
 def is_small(problem: Problem, s: int, step) -> bool:

@@ -135,6 +135,29 @@ def described(problem: Problem, densities: list[Densities]) -> dict:
     return out
 
 
+def spells(problem: Problem, densities: list[Densities]) -> dict[str, list[dict]]:
+    """For solution.json: what each body that stands in the world did, one spell after the other.
+
+    What lasts for less than ``WINDOW_S`` is no spell of its own, and goes with the one before it.
+    """
+    out: dict[str, list[dict]] = {}
+    time_ns = problem.epochs.time_ns
+    for variable, found in zip(problem.tie.variables, densities, strict=True):
+        standing = problem.tie.frames.edges[fr.body_frame(variable.body)].parent == fr.WORLD
+        if variable.kind != "moving" or not standing or len(found.label) == 0:
+            continue
+        starts = np.r_[0, np.flatnonzero(np.diff(found.label)) + 1]
+        told: list[dict] = []
+        for a, b in zip(starts, np.r_[starts[1:], len(found.label)], strict=True):
+            name, long = CLASSES[found.label[a]], time_ns[b] - time_ns[a] >= 1e9 * WINDOW_S
+            if told and (told[-1]["class"] == name or not long):
+                told[-1]["to_ns"] = int(time_ns[b])
+            else:
+                told.append({"class": name, "from_ns": int(time_ns[a]), "to_ns": int(time_ns[b])})
+        out[variable.body] = told
+    return out
+
+
 def _increments(problem: Problem, values: Values, found: Marginals, k: int):
     """Squares of the whitened motion residuals of a variable and their posterior variances, (E - 1, 2h) each."""
     c, at = problem.place(k)
