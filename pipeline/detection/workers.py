@@ -62,6 +62,10 @@ def search_slices(
     for part in slices:
         if (part.camera, part.number) not in left:
             report(part)
+    # An interrupt that comes while something compiles, or is loaded, is lost in a callback of the compiler.
+    if waiting:
+        with _interrupts_held():
+            warm_up(search)
     if workers <= 1 or len(slices) <= 1:
         with read_log(search.log, search.contents) as reader:
             finders = Finders(search)
@@ -69,9 +73,6 @@ def search_slices(
                 write_piece(part, search_slice(part, search, reader, finders))
                 report(part)
         return
-    # An interrupt that comes while something compiles is lost in a callback of the compiler.
-    with _interrupts_held():
-        warm_up(search)
     lost_in_a_row = 0
     while waiting:
         suspects, waiting = _search_in_processes(search, waiting, workers, report)
@@ -121,12 +122,20 @@ def _single_threaded_children() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _interrupts_held() -> Iterator[None]:
+    """Keep Ctrl-C until the end; to be used in the main thread."""
     # A child is born with this mask: Ctrl-C cannot print its traceback before `_start_worker` runs in it.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    # The mask is this thread's: the system then gives the signal to another one (Arrow's, BLAS's), and Python would
+    # raise it here nevertheless.
+    came: list[int] = []
+    handler = signal.signal(signal.SIGINT, lambda number, _: came.append(number))
     try:
         yield
     finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        signal.signal(signal.SIGINT, handler)
+        if came:
+            signal.raise_signal(signal.SIGINT)
 
 
 def _search_in_processes(

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -211,3 +212,23 @@ def test_what_is_found_is_what_was_drawn(shift, tmp_path):
         assert set(columns["status"][rows]) == {"unknown id"}
         assert set(columns["how"][rows]) == {"searched"}
         assert columns["time_ns"].tolist() == (START + 8 * STEP * columns["frame"].astype(np.int64)).tolist()
+
+
+def test_an_interrupt_while_it_is_held_comes_at_the_end_whichever_thread_the_system_gives_it_to():
+    """Other threads do not hold it: while Arrow's are there, the system gives it to one of them at once."""
+    stop = threading.Event()
+    other = threading.Thread(target=stop.wait)
+    other.start()
+    handler, mask = signal.getsignal(signal.SIGINT), signal.pthread_sigmask(signal.SIG_BLOCK, ())
+    reached = False
+    try:
+        with pytest.raises(KeyboardInterrupt), workers_module._interrupts_held():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            reached = True
+    finally:
+        stop.set()
+        other.join()
+    assert reached
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert signal.pthread_sigmask(signal.SIG_BLOCK, ()) == mask
