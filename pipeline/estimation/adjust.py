@@ -9,22 +9,15 @@ import numpy as np
 from pipeline.config.site import EstimationSettings
 from pipeline.errors import EstimationError
 from pipeline.estimation import diagnostics, observability
-from pipeline.estimation.budget import correlation_time, epoch_classes, vertical_budgets
 from pipeline.estimation.densities import described, spells
 from pipeline.estimation.likelihood import log_likelihood
-from pipeline.estimation.marginals import (
-    BodyTrack,
-    Marginals,
-    body_track,
-    common_part,
-    marginals,
-)
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, problem_of
+from pipeline.estimation.published import published
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.estimation.repeated import WHITE, Repeated, with_offsets
 from pipeline.estimation.self_check import examine
-from pipeline.estimation.solution import BodyStates, Solution
+from pipeline.estimation.solution import Solution
 from pipeline.estimation.split import told
 from pipeline.estimation.values import Values, statics_of
 from pipeline.estimation.variances import settle
@@ -116,34 +109,17 @@ def problem_of_log(network: Network, tied, epochs: Epochs, repeated: Repeated = 
 
 def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings) -> Solution:
     """Marginals, tables and diagnostics at the optimum."""
-    values, weights = optimum.values, optimum.weights
-    found = marginals(problem, values, weights)
-    seen, span = _coverage(problem, settings.max_gap_s)
-    states = []
-    budget: dict = {}
-    by_class: dict = {}
-    edge_seen = np.zeros(len(problem.epochs.time_ns), dtype=bool)
-    lasting: dict = {}
-    for name in [*problem.network.bodies, fr.TOOL]:
-        frame = fr.TOOL if name == fr.TOOL else fr.body_frame(name)
-        if name == fr.WORLD or frame not in problem.tie.frames:
-            continue
-        track = body_track(problem, values, found, frame, name)
-        rows, body_seen = _published(track, seen, span)
-        if name == fr.TOOL:
-            edge_seen[rows] = body_seen[rows]
-            classes = epoch_classes(problem, values, track, body_seen)
-            budget, by_class = vertical_budgets(problem, found, track, rows, classes)
-            lasting = correlation_time(problem, found, track, rows, classes)
-        states.append(_states(problem, values, found, track, rows, body_seen))
-    corner_fits = diagnostics.fit_corners(problem, values, weights, found)
-    sensor_fits = diagnostics.fit_sensors(problem, values, weights, found)
+    values = optimum.values
+    all_epochs = published(problem, optimum, settings.max_gap_s)
+    corner_fits, sensor_fits, found = all_epochs.corner_fits, all_epochs.sensor_fits, all_epochs.first
     table = diagnostics.corner_table(problem, corner_fits)
     # Constant errors of corners have no file to be compared with, and are many.
     statics = [s for s in diagnostics.static_results(problem, values, found) if s.source != CORNERS]
     motion = diagnostics.motion_fit(problem, values)
     untold = observability.findings(problem)
-    checked, remarks = examine(problem, optimum, settings, found, edge_seen, corner_fits, sensor_fits)
+    checked, remarks = examine(
+        problem, optimum, settings, found, all_epochs.edge_seen, corner_fits, sensor_fits
+    )
     warnings = [
         *remarks,
         *problem.tie.warnings,
@@ -185,68 +161,11 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         "motion": motion,
         "pixels": diagnostics.pixel_rms(problem.network, table),
         "dropped": problem.epochs.dropped,
-        "error_budget": budget,
-        "error_budget_by_class": by_class,
-        "correlation_time_s": lasting,
+        "error_budget": all_epochs.budget,
+        "error_budget_by_class": all_epochs.by_class,
+        "correlation_time_s": all_epochs.lasting,
         "observability": [asdict(f) for f in untold],
         **checked,
         "warnings": warnings,
     }
-    return Solution(tuple(states), tuple(statics), table, figures, tuple(warnings))
-
-
-def _coverage(problem: Problem, max_gap_s: float):
-    """Per variable: which epochs have an observation near, and its first and last one."""
-    E, t = len(problem.epochs.time_ns), problem.epochs.time_s
-    when = [np.zeros(E, dtype=bool) for _ in problem.tie.variables]
-    for group in problem.corners:
-        for step in group.path:
-            if step.edge.kind != "static":
-                when[step.edge.index][group.epoch] = True
-    for readings in problem.sensors:
-        when[readings.variable][readings.epoch] = True
-    near, span = [], []
-    for variable, mask in zip(problem.tie.variables, when, strict=True):
-        at = np.flatnonzero(mask)
-        if len(at) == 0:
-            raise EstimationError(f"body '{variable.body}' has no observation that can be used")
-        after = t[at[np.minimum(np.searchsorted(at, np.arange(E)), len(at) - 1)]]
-        before = t[at[np.maximum(np.searchsorted(at, np.arange(E), side="right") - 1, 0)]]
-        near.append(np.minimum(np.abs(after - t), np.abs(t - before)) <= max_gap_s)
-        span.append((at[0], at[-1]))
-    return near, span
-
-
-def _published(track: BodyTrack, seen, span):
-    """Rows between the first and last observation of everything the body hangs on; and seen at every epoch."""
-    E = len(track.T_world_body)
-    first = max((span[k][0] for k in track.variables), default=0)
-    last = min((span[k][1] for k in track.variables), default=E - 1)
-    together = (
-        np.logical_and.reduce([seen[k] for k in track.variables]) if track.variables else np.ones(E, bool)
-    )
-    return np.arange(first, last + 1), together
-
-
-def _states(problem: Problem, values: Values, found: Marginals, track: BodyTrack, rows, seen) -> BodyStates:
-    angle, sigma = np.full(len(rows), np.nan), np.full(len(rows), np.nan)
-    for k, variable in enumerate(problem.tie.variables):
-        if variable.body == track.body and variable.kind == "joint":
-            c, at = problem.place(k)
-            y = found.Y[c][rows, at.start]
-            variance = found.Z[c][rows, at.start, at.start]
-            variance = variance + np.einsum(
-                "ni,ij,nj->n", y, found.P_zz[np.ix_(found.columns[c], found.columns[c])], y
-            )
-            angle, sigma = values.pose[k][rows], np.sqrt(variance)
-    return BodyStates(
-        track.body,
-        problem.epochs.time_ns[rows],
-        track.T_world_body[rows],
-        track.velocity[rows],
-        angle,
-        sigma,
-        seen[rows],
-        track.own[rows],
-        common_part(track, found.P_zz)[rows],
-    )
+    return Solution(all_epochs.states, tuple(statics), table, figures, tuple(warnings))

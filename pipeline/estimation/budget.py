@@ -7,9 +7,11 @@ class has a budget of its own; the correlation time says over how long the own p
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from pipeline.estimation.marginals import BodyTrack, Marginals, vertical_budget
+from pipeline.estimation.marginals import BodyTrack, Marginals
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.estimation.values import Values
@@ -52,12 +54,27 @@ def epoch_classes(problem: Problem, values: Values, track: BodyTrack, seen):
     return out
 
 
-def vertical_budgets(
-    problem: Problem, found: Marginals, track: BodyTrack, rows, classes
-) -> tuple[dict, dict]:
+def groups_of(problem: Problem) -> dict[str, np.ndarray]:
+    """Columns of the statics by source, for ``vertical_budget``."""
+    sources = [*SOURCES, CORNERS] if any(s.source == CORNERS for s in problem.network.statics) else [*SOURCES]
+    return {
+        source: np.concatenate(
+            [problem.statics.columns[k] for k, s in enumerate(problem.network.statics) if s.source == source]
+            or [np.array([], dtype=np.int64)]
+        )
+        for source in sources
+    }
+
+
+def median_budgets(variances: dict[str, np.ndarray], classes) -> tuple[dict, dict]:
     """Median standard deviation of the elevation of the cutting edge's middle by source, m.
 
-    ``rows`` (k,) are the published epochs, ``classes`` (E,) those of ``epoch_classes``.
+    Parameters
+    ----------
+    variances : dict of str to (k,) array
+        Of ``vertical_budget``, at the published epochs.
+    classes : (k,) int array
+        Of ``epoch_classes``, there.
 
     Returns
     -------
@@ -66,70 +83,96 @@ def vertical_budgets(
     by_class : dict of str to dict
         The same for each class that occurs, with ``epochs``, how many, and ``sigma``, that of all sources together.
     """
-    sources = [*SOURCES, CORNERS] if any(s.source == CORNERS for s in problem.network.statics) else [*SOURCES]
-    groups = {
-        source: np.concatenate(
-            [problem.statics.columns[k] for k, s in enumerate(problem.network.statics) if s.source == source]
-            or [np.array([], dtype=np.int64)]
-        )
-        for source in sources
-    }
-    if len(rows) == 0:
+    if len(classes) == 0:
         return {}, {}
-    parts = vertical_budget(track, found.P_zz, groups, rows)
-    here = classes[rows]
 
     def medians(use):
-        return {name: round(float(np.sqrt(np.median(v[use]))), 6) for name, v in parts.items()}
+        return {name: round(float(np.sqrt(np.median(v[use]))), 6) for name, v in variances.items()}
 
     by_class = {}
     for c, name in enumerate(CLASSES):
-        use = here == c
+        use = classes == c
         if np.any(use):
-            whole = np.sqrt(np.median(np.sum([v[use] for v in parts.values()], axis=0)))
+            whole = np.sqrt(np.median(np.sum([v[use] for v in variances.values()], axis=0)))
             by_class[name] = {"epochs": int(use.sum()), "sigma": round(float(whole), 6)} | medians(use)
-    observed = here != CLASSES.index("bridged")
+    observed = classes != CLASSES.index("bridged")
     return (medians(observed) if np.any(observed) else {}), by_class
 
 
-def correlation_time(problem: Problem, found: Marginals, track: BodyTrack, rows, classes) -> dict:
-    """How long the own part of the cutting edge's elevation stays the same error, seconds.
+class Lasting:
+    """How long the own part of the cutting edge's elevation stays the same error, gathered from the last part on.
 
     The own covariance of two epochs is ``Z_k,k+j = (-G_k) ... (-G_k+j-1) Z_k+j``. The time is that after which their
-    correlation has fallen to 1/e, by interpolation; epochs nearer than that are not independent witnesses.
-
-    Returns
-    -------
-    dict of str to float
-        ``median`` over all published epochs, ``longest`` (95 % are shorter), and the median by class; empty where
-        nothing moves.
+    correlation has fallen to 1/e, by interpolation; epochs nearer than that are not independent witnesses. An epoch is
+    followed for at most ``HORIZON`` others, so that much of the parts that come after is kept.
     """
-    if len(rows) < 3 or not track.J_x:
-        return {}
-    starts = np.unique(np.linspace(rows[0], rows[-1] - 1, min(STARTS, len(rows) - 1)).astype(int))
-    found_s = np.array([_fall(problem, found, track, k, rows[-1]) for k in starts.tolist()])
-    here = classes[starts]
-    times = {"median": np.median(found_s), "longest": np.quantile(found_s, 0.95)}
-    times |= {name: np.median(found_s[here == c]) for c, name in enumerate(CLASSES) if np.any(here == c)}
-    return {name: round(float(value), 3) for name, value in times.items()}
 
+    def __init__(self, time_s, rows):
+        self.time_s, self.last = time_s, rows[-1] if len(rows) else -1
+        self.starts = np.array([], dtype=np.int64)
+        if len(rows) >= 3:
+            self.starts = np.unique(
+                np.linspace(rows[0], rows[-1] - 1, min(STARTS, len(rows) - 1)).astype(np.int64)
+            )
+        self.seconds = np.zeros(len(self.starts))
+        self.ahead: dict[int, _Carried] = {}
 
-def _fall(problem: Problem, found: Marginals, track: BodyTrack, k: int, last: int) -> float:
-    t = problem.epochs.time_s
-    up = track.T_world_body[:, 2, :3]
-    carried = {c: up[k] @ J_x[k, :3] for c, J_x in track.J_x.items()}
-    start = sum(float(a @ found.Z[c][k] @ a) for c, a in carried.items())
-    at = 1.0
-    for j in range(k + 1, min(last, k + HORIZON) + 1):
-        covariance, variance = 0.0, 0.0
+    def add(self, track: BodyTrack, found: Marginals, start: int, count: int) -> None:
+        """A part's ``count`` own epochs from ``start`` on: its track of the tool and its marginals."""
+        up = track.T_world_body[:count, 2, :3]
+        window = {}
         for c, J_x in track.J_x.items():
-            carried[c] = -carried[c] @ found.G[c][j - 1]
-            m = up[j] @ J_x[j, :3]
-            forward = found.Z[c][j] @ m
-            covariance += float(carried[c] @ forward)
-            variance += float(m @ forward)
-        before, at = at, covariance / max(np.sqrt(start * variance), 1e-300)
-        if at < np.exp(-1.0):
-            share = (before - np.exp(-1.0)) / max(before - at, 1e-12)
-            return float(t[j - 1] + share * (t[j] - t[j - 1]) - t[k])
-    return float(t[min(last, k + HORIZON)] - t[k])
+            m = np.einsum("ni,nij->nj", up, J_x[:count, :3])
+            own = _Carried(m, found.Z[c][:count], found.G[c][:count])
+            window[c] = own.before(self.ahead[c]) if c in self.ahead else own
+        for i in np.flatnonzero((self.starts >= start) & (self.starts < start + count)):
+            self.seconds[i] = self._fall(window, start, int(self.starts[i]))
+        self.ahead = {c: part.first(HORIZON + 1) for c, part in window.items()}
+
+    def _fall(self, window: dict[int, _Carried], start: int, k: int) -> float:
+        t, end = self.time_s, min(self.last, k + HORIZON)
+        carried = {c: part.m[k - start] for c, part in window.items()}
+        variance_k = sum(float(a @ window[c].Z[k - start] @ a) for c, a in carried.items())
+        at = 1.0
+        for j in range(k + 1, end + 1):
+            covariance, variance = 0.0, 0.0
+            for c, part in window.items():
+                carried[c] = -carried[c] @ part.G[j - 1 - start]
+                forward = part.Z[j - start] @ part.m[j - start]
+                covariance += float(carried[c] @ forward)
+                variance += float(part.m[j - start] @ forward)
+            before, at = at, covariance / max(np.sqrt(variance_k * variance), 1e-300)
+            if at < np.exp(-1.0):
+                share = (before - np.exp(-1.0)) / max(before - at, 1e-12)
+                return float(t[j - 1] + share * (t[j] - t[j - 1]) - t[k])
+        return float(t[end] - t[k])
+
+    def described(self, classes) -> dict:
+        """``median`` over all starts, ``longest`` (95 % are shorter), and the median by class; seconds.
+
+        ``classes`` (E,) are those of ``epoch_classes``. Empty where nothing moves.
+        """
+        if len(self.starts) == 0 or not self.ahead:
+            return {}
+        here, s = classes[self.starts], self.seconds
+        times = {"median": np.median(s), "longest": np.quantile(s, 0.95)}
+        times |= {name: np.median(s[here == c]) for c, name in enumerate(CLASSES) if np.any(here == c)}
+        return {name: round(float(value), 3) for name, value in times.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class _Carried:
+    """One chain over some epochs: how the elevation moves with its states, and how these hang together."""
+
+    m: np.ndarray
+    """(n, b)."""
+    Z: np.ndarray
+    """(n, b, b)."""
+    G: np.ndarray
+    """(n, b, b), one less at the end of the log."""
+
+    def before(self, other: _Carried) -> _Carried:
+        return _Carried(*(np.concatenate([getattr(self, f), getattr(other, f)]) for f in ("m", "Z", "G")))
+
+    def first(self, count: int) -> _Carried:
+        return _Carried(self.m[:count].copy(), self.Z[:count].copy(), self.G[:count].copy())

@@ -27,6 +27,7 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 
 from pipeline.estimation import motion
 from pipeline.estimation.marginals import Marginals
+from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem, motion_residual
 from pipeline.estimation.values import Values
 from pipeline.network import frames as fr
@@ -45,8 +46,6 @@ FASTEST = 30.0
 """Factor by which a density may move in one round: the states are linear in it only so far."""
 LEAST_SHARE = 1e-6
 """Of the configured density. Parked, the pictures cannot tell less from nothing, and the blocks' condition suffers."""
-CHUNK = 20_000
-"""Epochs whose Jacobians are held at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,27 +78,45 @@ def configured(problem: Problem, values: Values) -> list[Densities]:
     return out
 
 
-def learned(problem: Problem, values: Values, found: Marginals, now: list[Densities]) -> list[Densities]:
-    """One round: densities at which the marginal likelihood of these states is stationary."""
-    out = []
-    for k, variable in enumerate(problem.tie.variables):
-        square, trace = _increments(problem, values, found, k)
-        old = now[k]
-        density, count = old.density.copy(), np.zeros_like(old.density)
-        parts = {1: [0, 1]} if variable.kind == "joint" else {0: [0, 1, 2, 6, 7, 8], 1: [3, 4, 5, 9, 10, 11]}
-        for part, columns in parts.items():
-            for c in range(len(CLASSES)):
-                rows = np.flatnonzero(old.label == c)
-                known = float(np.sum(1 - trace[rows][:, columns]))
-                total = float(np.sum(square[rows][:, columns]))
-                count[c, part] = max(known, 0.0)
-                if known < ENOUGH:
-                    continue
-                factor = np.clip(total / known, 1 / FASTEST, FASTEST)
-                floor = LEAST_SHARE * variable.motion[part]
-                density[c, part] = max(density[c, part] * factor, floor)
-        out.append(Densities(old.label, density, count))
-    return out
+class Increments:
+    """What the smoothed increments say of the densities, summed by variable, class and part of the motion."""
+
+    def __init__(self, problem: Problem, now: list[Densities]):
+        self.problem, self.now = problem, now
+        self.total = [np.zeros((len(CLASSES), 2)) for _ in now]
+        """Sums of squares of the whitened motion residuals."""
+        self.known = [np.zeros((len(CLASSES), 2)) for _ in now]
+        """``N - T``."""
+
+    def add(self, part: Part, found: Marginals) -> None:
+        """The increments of a part of the log, and that to the part that follows."""
+        for k, (variable, now) in enumerate(zip(self.problem.tie.variables, self.now, strict=True)):
+            square, trace = _increments(part.problem, part.values, found, k)
+            label = now.label[part.start : part.start + len(square)]
+            halves = (
+                {1: [0, 1]} if variable.kind == "joint" else {0: [0, 1, 2, 6, 7, 8], 1: [3, 4, 5, 9, 10, 11]}
+            )
+            for half, columns in halves.items():
+                for c in range(len(CLASSES)):
+                    rows = np.flatnonzero(label == c)
+                    self.known[k][c, half] += float(np.sum(1 - trace[rows][:, columns]))
+                    self.total[k][c, half] += float(np.sum(square[rows][:, columns]))
+
+    def learned(self) -> list[Densities]:
+        """One round: densities at which the marginal likelihood of these states is stationary."""
+        out = []
+        for k, variable in enumerate(self.problem.tie.variables):
+            old, known, total = self.now[k], self.known[k], self.total[k]
+            density = old.density.copy()
+            for half in (1,) if variable.kind == "joint" else (0, 1):
+                for c in range(len(CLASSES)):
+                    if known[c, half] < ENOUGH:
+                        continue
+                    factor = np.clip(total[c, half] / known[c, half], 1 / FASTEST, FASTEST)
+                    floor = LEAST_SHARE * variable.motion[half]
+                    density[c, half] = max(density[c, half] * factor, floor)
+            out.append(Densities(old.label, density, np.maximum(known, 0.0)))
+        return out
 
 
 def moved_by(old: list[Densities], new: list[Densities]) -> float:
@@ -161,21 +178,13 @@ def spells(problem: Problem, densities: list[Densities]) -> dict[str, list[dict]
 def _increments(problem: Problem, values: Values, found: Marginals, k: int):
     """Squares of the whitened motion residuals of a variable and their posterior variances, (E - 1, 2h) each."""
     c, at = problem.place(k)
-    n = len(problem.dt_s)
-    squares, traces = [], []
-    e, J_1, J_2 = motion_residual(problem, values, k)
-    assert J_1 is not None and J_2 is not None
-    for a in range(0, n, CHUNK):
-        rows = slice(a, min(a + CHUNK, n))
-        after = slice(rows.start + 1, rows.stop + 1)
-        Z_1, Z_2 = found.Z[c][rows, at, at], found.Z[c][after, at, at]
-        Z_12 = -(found.G[c][rows] @ found.Z[c][after])[:, at, at]
-        A, B = J_1[rows], J_2[rows]
-        trace = np.sum((A @ Z_1) * A, axis=-1) + np.sum((B @ Z_2) * B, axis=-1)
-        trace += 2 * np.sum((A @ Z_12) * B, axis=-1)
-        squares.append(e[rows] ** 2)
-        traces.append(np.clip(trace, 0.0, 1.0))
-    return np.concatenate(squares or [e**2]), np.concatenate(traces or [e**2])
+    e, A, B = motion_residual(problem, values, k)
+    assert A is not None and B is not None
+    Z = found.Z[c][:, at, at]
+    Z_12 = -(found.G[c] @ found.Z[c][1:])[:, at, at]
+    trace = np.sum((A @ Z[:-1]) * A, axis=-1) + np.sum((B @ Z[1:]) * B, axis=-1)
+    trace += 2 * np.sum((A @ Z_12) * B, axis=-1)
+    return e**2, np.clip(trace, 0.0, 1.0)
 
 
 def parked(problem: Problem, k: int):

@@ -121,7 +121,7 @@ def motion_fit(problem: Problem, values: Values) -> dict:
     """
     out = {}
     for k, variable in enumerate(problem.tie.variables):
-        e = motion_residual(problem, values, k)[0] ** 2
+        e = motion_residual(problem, values, k, jacobians=False)[0] ** 2
         if len(e) == 0:
             continue
         if variable.kind == "joint":

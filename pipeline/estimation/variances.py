@@ -15,7 +15,7 @@ from pipeline.estimation import densities as motion_densities
 from pipeline.estimation import repeated as repeats
 from pipeline.estimation.densities import Densities
 from pipeline.estimation.likelihood import log_likelihood
-from pipeline.estimation.marginals import marginals
+from pipeline.estimation.marginals import marginals_by_part
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, huber, lengths
 from pipeline.estimation.repeated import Repeated
@@ -52,9 +52,11 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
     trial, at, shares, rounds = problem, optimum, repeated, 0
     likely: list[float] = []
     for _ in range(ROUNDS):
-        found = marginals(trial, at.values, at.weights)
+        increments = motion_densities.Increments(trial, densities)
+        for part, found in marginals_by_part(trial, at.values, at.weights):
+            increments.add(part, found)
         likely.append(log_likelihood(trial, at, found.log_det))
-        new = motion_densities.learned(trial, at.values, found, densities)
+        new = increments.learned()
         told = told_by(trial, at, settings.huber) if repeated.resting > 0 else None
         moved = motion_densities.moved_by(densities, new)
         trial = replace(

@@ -148,10 +148,10 @@ def test_a_risky_step_that_is_not_mended_is_taken_back(problem, plain, monkeypat
 
         def solve(self, damping):
             super().solve(damping)
-            self.longest = next(lengths)
+            self.pull = next(lengths)
             self.deltas = [1e-4 * np.ones_like(d) for d in self.deltas]
 
     monkeypatch.setattr(iterations, "_Step", Worse)
-    ended, _, converged, _, cost = iterations._iterate(problem, values, weights, 3, irls=0)
-    assert not converged and cost <= plain.cost * (1 + 1e-9)
+    ended, *_, cost = iterations._iterate(problem, values, weights, 3, irls=0)
+    assert cost <= plain.cost * (1 + 1e-9)
     np.testing.assert_array_equal(ended.z, values.z)

@@ -8,7 +8,7 @@ import pytest
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation import adjust
 from pipeline.estimation.adjust import problem_of_log
-from pipeline.estimation.budget import correlation_time
+from pipeline.estimation.budget import Lasting
 from pipeline.estimation.marginals import body_track, marginals
 from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import optimise
@@ -63,7 +63,9 @@ def test_the_correlation_time_is_that_of_a_dense_inverse():
                                          t[k + below[0] - 1 : k + below[0] + 1]) - t[k]))  # fmt: skip
         else:
             times.append(float(t[-1] - t[k]))
-    ours = correlation_time(problem, found, track, np.arange(E), np.zeros(E, dtype=int))
+    lasting = Lasting(t, np.arange(E))
+    lasting.add(track, found, 0, E)
+    ours = lasting.described(np.zeros(E, dtype=int))
     print(f"median correlation time {ours['median']} s, dense {np.median(times):.3f} s")
     assert ours["median"] == pytest.approx(np.median(times), abs=2e-3)
 
