@@ -118,7 +118,7 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
         by_static[corners.intrinsics] = J @ statics.sensitivity(corners.intrinsics, values.z)
     if corners.offset is not None and len(statics.columns[corners.offset]):
         S = statics.sensitivity(corners.offset, values.z).reshape(4, 2, -1)
-        by_static[corners.offset] = -(corners.whitener @ S).reshape(n, 8, -1)
+        by_static[corners.offset] = -(corners.whitener @ S).reshape(n, 8, S.shape[-1])  # -1 fails on no rows
     return r, Jacobians(by_variable, by_static)
 
 

@@ -1,11 +1,14 @@
 """Every Jacobian of the adjustment against central differences, in one test."""
 
+from dataclasses import fields, replace
+
 import numpy as np
 import pytest
 
 from pipeline.estimation import motion
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.problem import first_residual, motion_residual
+from pipeline.estimation.repeated import Repeated, with_offsets
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.network import Readings
 from pipeline.network.datum import tie
@@ -172,3 +175,18 @@ def test_motion_residual_is_that_of_gtsam():
     ends = gtsam.StateData(0, 10, 0.0), gtsam.StateData(1, 11, dt)
     factor = gtsam.WnoaMotionFactorPose3(*ends, se3.swap_rotation_first(q))
     assert factor.error(values) == pytest.approx(0.5 * float(np.sum(ours**2)), rel=1e-9)
+
+
+def test_a_tag_with_a_constant_of_its_own_may_be_absent_from_a_part_of_the_log():
+    """No rows, and Jacobians of the right width: the main job fell over here when a log was published in parts."""
+    drawn = draw(2, Options(epochs=3))
+    network = with_offsets(drawn.network, drawn.observations, Repeated())
+    tied = tie(network, drawn.observations, drawn.readings)
+    epochs = epochs_of(network, drawn.observations.take(tied.used), drawn.readings)
+    problem = problem_of_log(network, tied, epochs, Repeated())
+    group = problem.corners[0]
+    arrays = {f.name: getattr(group, f.name) for f in fields(group)}
+    none = replace(group, **{name: a[:0] for name, a in arrays.items() if isinstance(a, np.ndarray)})
+    r, J = corner_residuals(none, problem.first, problem.statics)
+    assert group.offset is not None and r.shape == (0, 8)
+    assert J.statics[group.offset].shape == (0, 8, 8)
