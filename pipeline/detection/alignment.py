@@ -39,6 +39,8 @@ from pipeline.detection.straightening import bent_back, ideal_of
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
 
 MAX_CELLS = 16
+MORE_PARTLY = 2.0
+"""Of which at most so many times the contrast's share counts."""
 COARSE_PIXELS = 200
 """Pixels on edges for the first steps."""
 QUIET = 0.02
@@ -84,7 +86,22 @@ REASON, BLUR_PX, MOTION_PX, NOISE, CONTRAST, WHOLE, MISFIT_AT, RESPONSE_AT, RESU
 
 
 @numba.njit(cache=True, error_model="numpy")
-def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, out):
+def align_all(grey, prints, across, lenses, bent, uv, prior, most, rooms, out_uv, out_cov, out):
+    """Lay the prints of some tags over one picture: `align` for each row of the arrays.
+
+    `across` (k, 2) has the cells across each print and across the quad of its corners. `rooms` are two tuples of
+    arrays for the derivatives, residuals and owners of the pixels of one tag, and once more for those of its parts;
+    see `linearise`.
+    """
+    for k in range(len(uv)):
+        align(
+            grey, prints[k], across[k, 0], across[k, 1], lenses[k], bent, uv[k], prior, most, rooms,
+            out_uv[k], out_cov[k], out[k],
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, error_model="numpy")
+def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, out_cov, out):
     """Lay one print over the picture.
 
     Parameters
@@ -105,6 +122,8 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         Blur px, sigma of its variance px², sigma of its streak px², response, sigma of the response.
     most : int
         About how many pixels on edges are used at the most where the noise is `QUIET`.
+    rooms : pair of tuples
+        As of `align_all`.
     out_uv : (4, 2) float64 array
         Filled: corners, px.
     out_cov : (8, 8) float64 array
@@ -150,8 +169,8 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         return
 
     pixels = area * (n / border) ** 2
-    room = int(min(20.0 * most, 1.5 * pixels + 100)) + 100
-    J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
+    room_for, room_for_parts = rooms
+    J, r, who = room_for
     masked = np.zeros((MAX_CELLS, MAX_CELLS), np.bool_)
     # Pixels on edges: about three beside each side of each cell.
     on_edges = min(pixels, 5.0 * n * n * cell_px * prior[0])
@@ -160,7 +179,6 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
     flat = max(1, int(cell_px * cell_px / 3.0))
 
     reason, share = STANDS, 1.0
-    room_for = (J, r, who)
     place = (lens, bent, norm, window, quiet, lo, hi, cell_px)
     strides = (coarse, fine, flat)
     levels, uneven, parted = cells, False, False
@@ -173,7 +191,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, out_uv, out_cov, 
         if not parted and misfit < HOPELESS:
             # Something lies over the print, and the whole of it gave way: does a part of it fit by itself?
             parted = True
-            H = best_part(grey, cells, n, masked, H, par, prior, place, strides, room)
+            H = best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for_parts)
             H, m, A, share = _settle(
                 grey, levels, n, masked, H, par, prior, place, strides, room_for, False, False
             )
@@ -248,7 +266,8 @@ def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, fi
     while True:
         stride = coarse
         if not first:
-            more = min(max(sigma / (QUIET * max(par[GAIN], 1.0)), 1.0), 3.0) ** 2
+            most = 3.0 if share == 1.0 else MORE_PARTLY
+            more = min(max(sigma / (QUIET * max(par[GAIN], 1.0)), 1.0), most) ** 2
             stride = max(1, math.ceil(fine / more))
         H, m, A, x, step_px = step(
             grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for

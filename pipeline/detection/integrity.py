@@ -166,9 +166,13 @@ def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
             seen = (1 - b) * ((1 - a) * grey[top, left] + a * grey[top, left + 1]) + b * (
                 (1 - a) * grey[top + 1, left] + a * grey[top + 1, left + 1]
             )
-            T = brightness(levels, n, G, X, Y, par, scratch)
             u, v = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
-            model = par[OFFSET] + par[2] * u + par[3] * v + (par[GAIN] + par[4] * u + par[5] * v) * T
+            dark, gain = par[OFFSET] + par[2] * u + par[3] * v, par[GAIN] + par[4] * u + par[5] * v
+            # Blur only draws a cell towards its neighbours: most need not be blurred to know.
+            level = min(max(levels[j, i], 0.0), 1.0)
+            if levels[j, i] == cells[j, i] and abs(seen - min(dark + gain * level, 255.0)) < 0.1 * par[GAIN]:
+                continue
+            model = dark + gain * brightness(levels, n, G, X, Y, par, scratch)
             if abs(seen - min(model, 255.0)) > 0.4 * par[GAIN] or abs(levels[j, i] - cells[j, i]) > 0.65:
                 every += 1
                 if 2 <= i < n - 2 and 2 <= j < n - 2:

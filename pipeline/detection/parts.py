@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from pipeline.detection.gauss_newton import COARSE_STEP_PX, step
-from pipeline.detection.image_model import GAIN, PARAMETERS, linearise
+from pipeline.detection.image_model import GAIN, linearise
 from pipeline.detection.integrity import mask, rms_of_cells
 
 BETTER = 0.7
@@ -22,7 +22,7 @@ a white cover along a side stayed the print's own rim (7 sigmas off)."""
 
 
 @numba.njit(cache=True, error_model="numpy")
-def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
+def best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for):
     """Fit parts of the print alone, and begin again with the one by which most of the print lies well.
 
     The parts: without four tenths at one side, without a corner, and without the rim. How well the print lies is the
@@ -34,7 +34,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
     lens, bent, norm, window, quiet, _, _, _ = place
     coarse, _, flat = strides
     coarse *= 2
-    J, r, who = np.empty((room, PARAMETERS)), np.empty(room), np.empty((room, 3), np.int32)
+    J, r, who = room_for
     nothing = np.zeros_like(masked)
     rms = np.empty(n * n)
     first_H, first_par = H.copy(), par.copy()
@@ -45,7 +45,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room):
             held = _held_out(part, n, masked.shape[0])
             for _ in range(2):
                 trial_H, used, _, _, step_px = step(
-                    grey, cells, n, held, trial_H, trial_par, prior, place, coarse, flat, False, (J, r, who)
+                    grey, cells, n, held, trial_H, trial_par, prior, place, coarse, flat, False, room_for
                 )
                 if used == 0 or step_px < COARSE_STEP_PX:
                     break

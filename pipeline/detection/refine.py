@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import numpy as np
 
@@ -25,8 +25,9 @@ from pipeline.detection.alignment import (
     RESPONSE_AT,
     RESULTS,
     WHOLE,
-    align,
+    align_all,
 )
+from pipeline.detection.image_model import PARAMETERS
 from pipeline.detection.prints import print_of
 from pipeline.detection.straightening import TERMS, Straightening
 
@@ -40,6 +41,7 @@ UNDER_EXPOSED = "under-exposed"
 BLURRED = "blurred"
 ALL_PIXELS = 12_000
 """More than tags of 250 px have on their edges."""
+Room = tuple[np.ndarray, np.ndarray, np.ndarray]
 REASONS = ("", NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED)
 """By the numbers of `alignment`."""
 
@@ -107,6 +109,7 @@ class Refiner:
         )
         bends = intrinsics is not None and bool(np.any(np.asarray(intrinsics)[4:]))
         self._intrinsics = np.asarray(intrinsics, float) if bends else None
+        self._rooms: tuple[Room, Room] | None = None
         self._straightening: dict[tuple[int, ...], Straightening] = {}
 
     def refine(
@@ -137,12 +140,11 @@ class Refiner:
         uv = np.ascontiguousarray(uv, float).reshape(-1, 4, 2)
         n = len(uv)
         corners, cov, results = np.empty((n, 4, 2)), np.zeros((n, 8, 8)), np.zeros((n, RESULTS))
-        lenses = self._lenses(uv, grey.shape)
-        for k in range(n):
-            cells, across, border = _padded(str(family[k]), int(tag_id[k]))
-            align(
-                grey, cells, across, border, lenses[k], self._intrinsics is not None, uv[k], self._prior, pixels,
-                corners[k], cov[k], results[k],
+        if n:
+            prints, across = _padded(tuple(zip(family, tag_id)))
+            align_all(
+                grey, prints, across, self._lenses(uv, grey.shape), self._intrinsics is not None, uv, self._prior,
+                pixels, self._rooms_for(pixels), corners, cov, results,
             )  # fmt: skip
         return Refined(
             uv=corners,
@@ -157,6 +159,18 @@ class Refiner:
             reason=np.array([REASONS[int(code)] for code in results[:, REASON]], object),
         )
 
+    def _rooms_for(self, pixels: int) -> tuple[Room, Room]:
+        # Noisy tags take up to nine times as many pixels, and as many again lie off the edges. The system gives memory
+        # page by page as it is used, so that room for many costs nothing; asked for anew it would cost for each tag.
+        rows = 20 * pixels + 100
+        if self._rooms is None or len(self._rooms[0][1]) < rows:
+            a, b = (
+                (np.empty((rows, PARAMETERS)), np.empty(rows), np.empty((rows, 3), np.int32))
+                for _ in range(2)
+            )
+            self._rooms = a, b
+        return self._rooms
+
     def _lenses(self, uv: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         if self._intrinsics is None:
             return np.zeros((len(uv), TERMS + 2, 2))
@@ -165,10 +179,12 @@ class Refiner:
         return self._straightening[shape].windows(uv)
 
 
-@cache
-def _padded(family: str, tag_id: int) -> tuple[np.ndarray, int, int]:
-    """A print in a grid of `MAX_CELLS`, as every family has it; its cells across, and those of its quad."""
-    of = print_of(family, tag_id)
-    padded = np.zeros((MAX_CELLS, MAX_CELLS))
-    padded[: len(of.cells), : len(of.cells)] = of.cells
-    return padded, len(of.cells), of.border
+@lru_cache(maxsize=4096)
+def _padded(tags: tuple[tuple[str, int], ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Prints in grids of `MAX_CELLS`, as every family has them; cells across each, and across its quad."""
+    prints, across = np.zeros((len(tags), MAX_CELLS, MAX_CELLS)), np.empty((len(tags), 2), np.int64)
+    for k, (family, tag_id) in enumerate(tags):
+        of = print_of(family, tag_id)
+        prints[k, : len(of.cells), : len(of.cells)] = of.cells
+        across[k] = len(of.cells), of.border
+    return prints, across
