@@ -55,11 +55,15 @@ class Seen(Refined):
 
     def of(self, rows: np.ndarray) -> Seen:
         """Some of them."""
-        return Seen(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+        return Seen(**{name: getattr(self, name)[rows] for name in _SEEN})
 
     def on_tracks(self, track: np.ndarray) -> Seen:
         """The same, of these tracks."""
         return replace(self, track=np.asarray(track, int))
+
+
+_REFINED = tuple(field.name for field in fields(Refined))
+_SEEN = tuple(field.name for field in fields(Seen))
 
 
 def seen_at(
@@ -96,9 +100,11 @@ def seen_at(
     uv = np.asarray(uv, float).reshape(-1, 4, 2)
     refined = refiner.refine(grey, list(family), [int(number) for number in tag_id], uv, pixels)
     stands = np.asarray(refined.reason == "", bool)[:, None, None]
-    refined = replace(refined, uv=np.where(stands, refined.uv, uv), cov=np.where(stands, refined.cov, 0.0))
+    values = {name: getattr(refined, name) for name in _REFINED}
+    values["uv"] = np.where(stands, refined.uv, uv)
+    values["cov"] = np.where(stands, refined.cov, 0.0)
     return Seen(
-        **{field.name: getattr(refined, field.name) for field in fields(refined)},
+        **values,
         family=np.array([*family], object),
         tag_id=np.asarray(tag_id, int),
         hamming=np.zeros(n, int) if hamming is None else np.asarray(hamming, int),
@@ -133,15 +139,17 @@ def joined(parts: Sequence[Seen]) -> Seen:
     if len(parts) == 1:
         whole = parts[0]
     else:
-        columns = {
-            field.name: np.concatenate([getattr(part, field.name) for part in parts])
-            for field in fields(Seen)
-        }
+        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _SEEN}
         whole = Seen(**columns)
     if len(whole) < 2:
         return whole
-    order = sorted(
-        range(len(whole)),
-        key=lambda k: (whole.family[k], int(whole.tag_id[k]), whole.uv[k, 0, 0], whole.uv[k, 0, 1]),
-    )
+    keys = [
+        (family, number, u, v)
+        for family, number, (u, v) in zip(
+            whole.family.tolist(), whole.tag_id.tolist(), whole.uv[:, 0].tolist(), strict=True
+        )
+    ]
+    order = sorted(range(len(whole)), key=keys.__getitem__)
+    if order == [*range(len(whole))]:
+        return whole
     return whole.of(np.array(order, int))
