@@ -55,6 +55,7 @@ def test_a_slow_way_and_a_wrong_cost_miss_their_bars():
 
     good = [row(n, "ours") for n in solvers.LENGTHS] + [row(n, "gtsam", 6.0) for n in solvers.LENGTHS[:2]]
     cut = solvers.Row(100_000, "gtsam", ended="stopped after 600 s of the processor")
+    assert solvers.described(cut, good[2]).endswith(cut.ended)
     assert solvers.missed_bars([*good, cut]) == []
     assert "only 4.0 times faster" in solvers.missed_bars([*good[:4], row(10_000, "gtsam", 4.0), cut])[0]
     assert "off by" in solvers.missed_bars([*good, row(100_000, "gtsam", 99.0, 100.0001)])[0]
