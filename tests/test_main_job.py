@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 import subprocess
 import sys
 import time
@@ -10,6 +12,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.main_job import COVERAGE_BAR, RMSE_BAR_M, SAMPLE, SIGMA_RATIO_BAR, STATION_BAR_M, Score, score
+from pipeline import resources
+from tests.estimation.conforming import faults
 
 ROOT = Path(__file__).parents[1]
 
@@ -47,3 +51,27 @@ def test_the_report_is_small_and_the_second_run_does_no_work(sample, runs):
     assert time.monotonic() - start < 5.0
     assert again.stdout.splitlines()[-1].endswith(f"verdict {sample.verdict}")
     assert {file: file.stat().st_mtime_ns for file in page.parent.rglob("*.parquet")} == before
+
+
+def test_what_the_adjustment_says_of_itself_conforms_to_its_schema(sample, runs):
+    solution = json.loads((runs / "trench" / "solution.json").read_text(encoding="utf-8"))
+    schema = json.loads(resources.schema_text("artefacts/solution.schema.json"))
+    assert faults(solution, schema, schema) == []
+    rounds = solution["learned"]["log_likelihood"]
+    print(f"log likelihood {rounds}")
+    assert rounds[-1] > rounds[0]
+
+
+def test_the_same_log_adjusted_twice_gives_the_same_bytes(sample, runs, tmp_path):
+    """All that estimate and track write, from the same detections, in another process."""
+    again = tmp_path / "trench"
+    shutil.copytree(runs / "trench", again)
+    for name in ("estimate.manifest.json", "solution.json", "states.parquet", "poses.parquet"):
+        (again / name).unlink()
+    command = [sys.executable, "-m", "pipeline", "report", str(ROOT / SAMPLE), "--runs", str(tmp_path)]
+    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    for name in (
+        "solution.json",
+        *(f"{t}.parquet" for t in ("states", "statics", "residuals", "poses", "cutting_edge")),
+    ):
+        assert (again / name).read_bytes() == (runs / "trench" / name).read_bytes(), name
