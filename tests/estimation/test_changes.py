@@ -107,6 +107,7 @@ def test_a_camera_that_turned_is_told_as_one_of_the_two_that_sit_on_the_cab(clea
     assert abs(turn - TURNED_RAD) < 3 * sigma and sigma < 0.2 * TURNED_RAD
 
 
+@pytest.mark.slow
 def test_two_changes_are_not_told_as_a_third():
     """A camera turns while nothing is seen, and then a board moves: what explains both best alone is another board."""
     drawn = inject(scene(1, 90.0), ["benchmark", "mount"], at_s=60.0).drawn  # the mount at 40 s
