@@ -32,16 +32,34 @@ machine has: it ties nothing, and keeps a body in reach that a stretch does not 
 def sample(problem: Problem, weights: Weights) -> tuple[Problem, Weights] | None:
     """A short log of stretches of this one, its statics the same; None where the log is short itself."""
     E = len(problem.epochs.time_ns)
-    blocks = -(-E // STRETCH)
-    picked = [np.linspace(0, blocks - 1, SPREAD).astype(np.int64)]
+    picked = [_spread(E, SPREAD)]
     for seen in (*(g.epoch for g in problem.corners), *(s.epoch for s in problem.sensors)):
         at = np.linspace(0, len(seen) - 1, OF_GROUP + 2)[1:-1].astype(np.int64)
         picked.append(seen[at] // STRETCH if len(seen) else at[:0])
     chosen = np.unique(np.concatenate(picked))
     if WORTH * STRETCH * len(chosen) >= E:
         return None
+    return of_stretches(problem, weights, _epochs(E, chosen))
+
+
+def stretches(problem: Problem, count: int) -> np.ndarray:
+    """Epochs of at most so many stretches that lie evenly over the log."""
+    E = len(problem.epochs.time_ns)
+    return _epochs(E, np.unique(_spread(E, count)))
+
+
+def _spread(E: int, count: int):
+    return np.linspace(0, -(-E // STRETCH) - 1, count).astype(np.int64)
+
+
+def _epochs(E: int, chosen):
     epochs = (chosen[:, None] * STRETCH + np.arange(STRETCH)).ravel()
-    epochs = epochs[epochs < E]
+    return epochs[epochs < E]
+
+
+def of_stretches(problem: Problem, weights: Weights, epochs) -> tuple[Problem, Weights]:
+    """The log of some epochs only, rising; nothing is tied across those that are left out."""
+    E = len(problem.epochs.time_ns)
     corners, kept = _rows(problem.corners, weights.corners, epochs, E)
     sensors, read = _rows(problem.sensors, weights.sensors, epochs, E)
     seam = np.diff(epochs) > 1
@@ -52,16 +70,17 @@ def sample(problem: Problem, weights: Weights) -> tuple[Problem, Weights] | None
             epochs=replace(problem.epochs, time_ns=problem.epochs.time_ns[epochs]),
             corners=corners,
             sensors=sensors,
-            first=Values(
-                tuple(T[epochs] for T in problem.first.pose),
-                tuple(w[epochs] for w in problem.first.rate),
-                problem.first.z,
-            ),
+            first=at_epochs(problem.first, epochs),
             dt_s=np.where(seam, SEAM_S, problem.dt_s[before]),
             roots=tuple(np.where(seam[:, None], SEAM_ROOT, root[before]) for root in problem.roots),
         ),
         replace(weights, corners=kept, sensors=read),
     )
+
+
+def at_epochs(values: Values, epochs) -> Values:
+    """The states of some epochs, with all statics."""
+    return Values(tuple(T[epochs] for T in values.pose), tuple(w[epochs] for w in values.rate), values.z)
 
 
 def _rows(groups, alive, epochs, E: int):

@@ -10,7 +10,7 @@ from pipeline.config.site import EstimationSettings
 from pipeline.detection.found import sides_px
 from pipeline.detection.stillness import SIZE_CLASSES
 from pipeline.errors import EstimationError
-from pipeline.estimation import changes, split, validation
+from pipeline.estimation import approach, changes, split, validation
 from pipeline.estimation.diagnostics import Fit
 from pipeline.estimation.marginals import Marginals
 from pipeline.estimation.optimise import Optimum
@@ -19,8 +19,9 @@ from pipeline.estimation.steps import testable
 
 WORST = 10
 """Tags that are listed."""
-MOST_EPOCHS = 100_000
-"""Longest log whose changes and halves are looked at: both hold the normal equations whole, 2 GB of them."""
+HALVED = 64
+"""Stretches of 256 epochs, evenly over the log, of which odd and even frames are compared: as many frames tell the
+ratio to a hundredth, and the two halves of more would hold 2 GB of normal equations."""
 CHECKED = 0.05
 """A measurement with less redundancy is checked by nothing, and its normalised residual is noise over nothing."""
 
@@ -45,16 +46,17 @@ def examine(
     corner_fits, sensor_fits : list of Fit
         Per group and per sensor.
     """
-    short = len(problem.epochs.time_ns) <= MOST_EPOCHS
     steps: tuple[split.Step, ...] = ()
     halves: dict = {}
-    why = "" if short else f"the log has more than {MOST_EPOCHS} epochs"
+    why = ""
     # The answer stands without them: what these two cannot solve is said, and no reason to have no report.
     try:
-        if short and settings.cross_validation:
-            halves = validation.odd_even(problem, optimum.values, optimum.weights, edge_seen)
-        if short:
-            steps, _, _ = split.trace(problem, optimum, settings.huber, settings.max_iterations)
+        if settings.cross_validation:
+            epochs = approach.stretches(problem, HALVED)
+            part, weights = approach.of_stretches(problem, optimum.weights, epochs)
+            values = approach.at_epochs(optimum.values, epochs)
+            halves = validation.odd_even(part, values, weights, edge_seen[epochs])
+        steps, _, _ = split.trace(problem, optimum, settings.huber, settings.max_iterations)
     except (EstimationError, np.linalg.LinAlgError) as error:
         why = f"without the damping of the adjustment it could not be solved ({error})"
     told = [describe(problem, step) for step in steps]
@@ -73,7 +75,7 @@ def examine(
         "left_out": predicted,
         "odd_even": halves,
         "changes": {
-            "tested": [problem.network.statics[s].name for s in testable(problem)] if short else [],
+            "tested": [problem.network.statics[s].name for s in testable(problem)],
             "instants": len(changes.instants(problem)),
             "needed": changes.FEWEST,
             "why": why,

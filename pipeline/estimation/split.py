@@ -9,9 +9,8 @@ import numpy as np
 import scipy.linalg
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import arrow, changes
-from pipeline.estimation.normal import linearise
-from pipeline.estimation.optimise import Optimum, optimise
+from pipeline.estimation import changes, sweeps
+from pipeline.estimation.optimise import Optimum, optimise, parts, pieces
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.residuals import Corners, SensorReadings
 from pipeline.estimation.steps import mounts_and_sensors
@@ -248,8 +247,8 @@ def trace(
     whole, at, places = adjusted(found)
     if not found:
         return (), whole, at
-    chains, C, g_z = linearise(whole, at.values, at.weights)
-    S = arrow.solve(chains, C, g_z).S
+    cut = parts(whole, at.values, at.weights)
+    S = sweeps.reduce(pieces(cut), len(cut)).S
     P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
     steps = (_measure(whole, at.values, P_zz, one, *places[i]) for i, one in enumerate(found))
     return tuple(steps), whole, at

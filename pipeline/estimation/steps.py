@@ -14,16 +14,16 @@ so all statics and all instants together cost about as much as the marginals.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
 from numba import njit
 
-from pipeline.estimation import arrow
-from pipeline.estimation.normal import linearise
-from pipeline.estimation.optimise import HOLD
+from pipeline.estimation import sweeps
+from pipeline.estimation.optimise import HOLD, parts, pieces
+from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem, Weights, huber, lengths, unchecked_statics
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.estimation.values import Values
@@ -76,48 +76,64 @@ def testable(problem: Problem) -> list[int]:
 
 
 def sums(problem: Problem, values: Values, weights: Weights, at) -> Sums:
-    """Scores and information for steps at the epochs ``at``; O(epochs)."""
+    """Scores and information for steps at the epochs ``at``; O(epochs), one part of the log in memory at a time."""
     p, K = problem.statics.size, len(at)
-    chains, C, g_z = linearise(problem, values, weights)
-    held = unchecked_statics(problem)
-    C[held, held] += HOLD
-    solved = arrow.solve(chains, C, g_z)
-    P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(solved.S), np.eye(p))
+    cut, held = parts(problem, values, weights), unchecked_statics(problem)
+
+    def hold(i: int, piece: sweeps.Piece) -> sweeps.Piece:
+        C = piece.C.copy()
+        C[held, held] += HOLD if i == 0 else 0.0
+        return replace(piece, C=C)
+
+    linearised = pieces(cut, finish=hold)
+    reduced = sweeps.reduce(linearised, len(cut))
+    P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(reduced.S), np.eye(p))
     tested = testable(problem)
     columns = [problem.statics.columns[s] for s in tested]
     owner = np.repeat(tested, [len(c) for c in columns])
     rows = {s: np.flatnonzero(owner == s) for s in tested}
     place = np.full(p, -1)
     place[np.concatenate([*columns, np.array([], dtype=np.int64)]).astype(np.int64)] = np.arange(len(owner))
-    g, info = _measured(problem, values, weights, at, place, len(owner))
-    own = _from_the_end(info[:, :, place >= 0][:, :, np.argsort(place[place >= 0])])
-    g += info @ solved.dz
-    bounds = [slice(a, b) for a, b in pairwise([*at.tolist(), len(problem.epochs.time_ns)])]
-    for chain, factored, Y, dx in zip(chains, solved.factors, arrow.border(solved), solved.dx, strict=True):
-        here = np.flatnonzero(place[chain.columns] >= 0)
-        if len(here) == 0:
-            continue
-        to = place[chain.columns[here]]
-        B = np.ascontiguousarray(chain.B[:, :, here])
-        Z, G = arrow.selected_inverse(factored)
-        Q = np.zeros((K, len(here), len(here)))
-        _tails(Z, G, B, owner[to], at, Q)
-        own[np.ix_(np.arange(K), to, to)] -= Q
-        for j, part in enumerate(bounds):
-            B_j = B[part].reshape(-1, len(here))
-            info[np.ix_(np.array([j]), to, chain.columns)] -= (B_j.T @ Y[part].reshape(len(B_j), -1))[None]
-            g[j, to] += B_j.T @ dx[part].ravel()
-    return Sums(at, rows, _from_the_end(g), own, _from_the_end(info), P_zz)
+    g, info, states = np.zeros((K, len(owner))), np.zeros((K, len(owner), p)), np.zeros((K, len(owner), p))
+    own = np.zeros((K, len(owner), len(owner)))
+    tails: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    steps = sweeps.steps(linearised, reduced)
+    for (i, inverses), (_, moved) in zip(sweeps.inverses(linearised, reduced), steps, strict=True):
+        part, n = cut[i], cut[i].epochs
+        ends = np.clip([*at.tolist(), len(problem.epochs.time_ns)], part.start, part.stop) - part.start
+        _measure(part, ends, place, g, info)
+        for c, (chain, found, dx) in enumerate(zip(linearised(i).chains, inverses, moved, strict=True)):
+            here = np.flatnonzero(place[chain.columns] >= 0)
+            if len(here) == 0:
+                continue
+            to = place[chain.columns[here]]
+            B = np.ascontiguousarray(chain.B[:n, :, here])
+            if c not in tails:
+                tails[c] = np.zeros((B.shape[1], len(here))), np.zeros((len(here), len(here)))
+            Q = np.zeros((K, len(here), len(here)))
+            _tails(found.Z, found.G, B, owner[to], at - part.start, *tails[c], Q)
+            own[np.ix_(np.arange(K), to, to)] -= Q
+            for j, (a, b) in enumerate(pairwise(ends.tolist())):
+                if b > a:
+                    B_j = B[a:b].reshape(-1, len(here))
+                    told = B_j.T @ found.Y[a:b].reshape(len(B_j), -1)
+                    states[np.ix_(np.array([j]), to, chain.columns)] += told[None]
+                    g[j, to] += B_j.T @ dx[a:b].ravel()
+    own += _from_the_end(info[:, :, place >= 0][:, :, np.argsort(place[place >= 0])])
+    g += info @ reduced.dz
+    return Sums(at, rows, _from_the_end(g), own, _from_the_end(info - states), P_zz)
 
 
 def _from_the_end(parts):
     return np.cumsum(parts[::-1], axis=0)[::-1].copy()
 
 
-def _measured(problem: Problem, values: Values, weights: Weights, at, place, count: int):
-    """By stretch: gradient (K, q) of the tested statics and their information (K, q, p), with the states held."""
-    K, p = len(at), problem.statics.size
-    g, info = np.zeros((K, count)), np.zeros((K, count, p))
+def _measure(part: Part, ends, place, g, info) -> None:
+    """Add a part's gradient (K, q) of the tested statics and their information (K, q, p), with the states held.
+
+    ``ends`` (K + 1,) are those of the stretches, in the part's epochs.
+    """
+    problem, values, weights = part.problem, part.values, part.weights
 
     def add(epoch, r, J, group, alive, share):
         if not J.statics:
@@ -130,8 +146,7 @@ def _measured(problem: Problem, values: Values, weights: Weights, at, place, cou
         r = np.where(use, r, 0.0)
         here = np.flatnonzero(place[z] >= 0)
         to = place[z[here]]
-        ends = np.searchsorted(epoch, [*at.tolist(), len(problem.epochs.time_ns)]).tolist()
-        for j, (a, b) in enumerate(pairwise(ends)):
+        for j, (a, b) in enumerate(pairwise(np.searchsorted(epoch, ends).tolist())):
             if b > a:
                 A_j = A[a:b].reshape(-1, len(z))
                 wA = A_j[:, here] * weight[a:b].reshape(-1, 1)
@@ -144,17 +159,20 @@ def _measured(problem: Problem, values: Values, weights: Weights, at, place, cou
     for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
         r, J = sensor_residuals(readings, values, problem.statics)
         add(readings.epoch, r, J, 1, alive, 1.0)
-    return g, info
 
 
 @njit(cache=True, error_model="numpy")
-def _tails(Z, G, B, owner, at, out):
-    """``Q(tau)`` at each candidate, blocks of one static only, into out (K, q, q); owner: the static of a column."""
+def _tails(Z, G, B, owner, at, R, total, out):
+    """``Q(tau)`` at each candidate of a part, blocks of one static only, into out (K, q, q).
+
+    ``owner`` is the static of a column. ``R`` (b, q) and the sum ``total`` (q, q) come from the part that follows, and
+    go to the one before; candidates beyond this part are left alone.
+    """
     n, b, q = B.shape
-    R = np.zeros((b, q))
     new = np.zeros((b, q))
-    total = np.zeros((q, q))
     j = len(at) - 1
+    while j >= 0 and at[j] >= n:
+        j -= 1
     for k in range(n - 1, -1, -1):
         for c in range(q):
             for i in range(b):
@@ -162,7 +180,7 @@ def _tails(Z, G, B, owner, at, out):
                 d = 0.0
                 for m in range(b):
                     s += Z[k, i, m] * B[k, m, c]
-                    if k < n - 1:
+                    if k < len(G):
                         d += G[k, i, m] * R[m, c]
                 new[i, c] = s - 2.0 * d
             # new is Z B - 2 G R: its product with B is the sum's symmetric part before it is made symmetric.

@@ -10,6 +10,7 @@ from pipeline.estimation import adjust, changes, split, steps
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.normal import linearise
 from pipeline.estimation.optimise import optimise
+from pipeline.estimation.parts import bounds
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
@@ -32,8 +33,10 @@ def clean():
     return scene(1, 40.0)
 
 
-def test_scores_and_information_of_a_step_are_those_of_one_more_dense_column():
-    """The step's column written out: its border from the instant on, eliminated by a dense solve."""
+@pytest.mark.parametrize("size", [2048, 7])
+def test_scores_and_information_of_a_step_are_those_of_one_more_dense_column(size, monkeypatch):
+    """The step's column written out: its border from the instant on, eliminated by a dense solve; in parts, too."""
+    monkeypatch.setattr("pipeline.estimation.optimise.bounds", lambda problem: bounds(problem, size))
     problem = _problem(scene(3, 3.0))
     values = problem.first
     weights = changes.wide_weights(problem, values, 1e6)
