@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.config.site import EstimationSettings
 from pipeline.errors import EstimationError
 from pipeline.estimation import diagnostics, observability
-from pipeline.estimation.densities import described, spells
+from pipeline.estimation.densities import described, shaking, spells
 from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, problem_of
@@ -72,6 +72,8 @@ def adjust(
     tied = tie_network(network, observations, readings)
     epochs = epochs_of(network, observations.take(tied.used), readings)
     problem = told(problem_of_log(network, tied, epochs, repeated), settings.split)
+    if learn:
+        problem = shaking(problem)
     optimum = optimise(problem, settings.huber, settings.max_iterations)
     if not optimum.converged and optimum.last_step_sigmas > LOST_SIGMAS:
         raise EstimationError(

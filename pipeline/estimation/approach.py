@@ -24,8 +24,8 @@ OF_GROUP = 4
 """Stretches that lie evenly over the sightings of each camera and marker, and over the readings of each sensor."""
 WORTH = 3
 """A sample is taken of logs that are longer than so many samples."""
-SEAM_S, SEAM_ROOT = 1.0, 100.0
-"""Between stretches motion is taken as over a second, with a root of the density (m/s^1.5 and rad/s^1.5) that no
+SEAM_S, SEAM_DENSITY = 1.0, np.array([1e4, 0.0])
+"""Between stretches motion is taken as over a second, with a density of acceleration (m²/s³ and rad²/s³) that no
 machine has: it ties nothing, and keeps a body in reach that a stretch does not show."""
 
 
@@ -72,7 +72,9 @@ def of_stretches(problem: Problem, weights: Weights, epochs) -> tuple[Problem, W
             sensors=sensors,
             first=at_epochs(problem.first, epochs),
             dt_s=np.where(seam, SEAM_S, problem.dt_s[before]),
-            roots=tuple(np.where(seam[:, None], SEAM_ROOT, root[before]) for root in problem.roots),
+            densities=tuple(
+                np.where(seam[:, None, None], SEAM_DENSITY, q[before]) for q in problem.densities
+            ),
         ),
         replace(weights, corners=kept, sensors=read),
     )

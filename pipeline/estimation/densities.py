@@ -1,26 +1,28 @@
-"""Spectral densities of the motion prior, learned from the log: how much each body accelerates, by what it is doing.
+"""Spectral densities of the motion prior, learned from the log: how much each body accelerates and shakes.
 
-The marginal likelihood of a density ``q`` is stationary where (MacKay 1992, for evidence of a Gaussian prior)
+Two causes move a component between two epochs: white noise on acceleration, of density ``a``, which is work, and white
+noise on velocity, of density ``v``, which is shaking (``motion``). Each has its part of an increment's covariance,
+``Q = Q_a + Q_v``; the marginal likelihood of the densities is stationary where (MacKay 1992, for one cause)
 
-    q_new = q sum |e|² / (N - T),      T = sum tr(J P J')
+    q_new = q sum e'M e / (sum tr M - T),      M = W Q_q W',      T = sum tr(M J P J')
 
-with ``e`` the ``N`` components of the whitened motion residuals at the smoothed states, ``J`` their Jacobians and ``P``
-the covariance of neighbouring states: ``N - T`` of the increments were measured, the rest the prior made up. Plain
-expectation-maximisation, ``q (sum |e|² + T) / N``, has the same fixed point but needs hundreds of rounds at
-15 readings a second, where a single increment is next to unmeasured and ``T`` is nearly ``N``.
+with ``e`` the whitened motion residuals at the smoothed states, ``W'W = Q^-1``, ``J`` their Jacobians and ``P`` the
+covariance of neighbouring states: ``tr M - T`` of the increments were measured, the rest the prior made up. Plain
+expectation-maximisation has the same fixed point but needs hundreds of rounds at 15 readings a second, where a single
+increment is next to unmeasured and ``T`` is nearly all.
+
+Every component has densities of its own: a cab turns about its vertical axis and shakes about the others. With one for
+three axes, and acceleration alone, a cab that shakes at up to 4 Hz, filmed at 5 Hz, had an edge 5.8 mm off half-way
+between its pictures and a stated own part of 4.1 mm; now 5.1 and 5.6 mm. Levels of acceleration by three seconds were
+tried too: they stated 2.3 mm, since what lies above half the frame rate is folded into slow motion.
 
 One density for a shift would be the mean of work and rest; so the intervals of a body are sorted first: **parked**
 where the pictures and readings of two seconds show nothing but noise, **tramming** where it travels, else **working**.
-
-Finer sorting was tried, with a level of its own for every three seconds: a cab that shakes at up to 4 Hz, filmed at
-5 Hz, then got an own sigma of 2.3 mm at the edge where it was 4.5 mm off. What lies above half the frame rate is folded
-into what is seen as slow motion, and no likelihood of the pictures brings it back; the mean over work, with its swings,
-states 4.1 mm.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -46,6 +48,8 @@ FASTEST = 30.0
 """Factor by which a density may move in one round: the states are linear in it only so far."""
 LEAST_SHARE = 1e-6
 """Of the configured density. Parked, the pictures cannot tell less from nothing, and the blocks' condition suffers."""
+SHAKE_S = 0.1
+"""At the start a body shakes as much as it works over this time, a frame or less."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,77 +59,86 @@ class Densities:
     label: np.ndarray
     """(E - 1,) index into ``CLASSES`` of each interval."""
     density: np.ndarray
-    """(3, 2) by class: translation m²/s³ (1 for a joint, unused) and rotation rad²/s³."""
+    """(3, h, 2) by class and component: of acceleration, m²/s³ or rad²/s³, and of velocity, m²/s or rad²/s."""
     measured: np.ndarray
-    """(3, 2) how many increments of each were measured, ``N - T``; 0 before anything was learned."""
+    """(3, h) how many increments of each were measured; 0 before anything was learned."""
 
-    def roots(self, kind: str):
-        """(E - 1, h), for ``Problem.roots``."""
-        table = np.array([motion.root_density(kind, tuple(row)) for row in self.density])
-        return table[self.label]
+    def by_interval(self):
+        """(E - 1, h, 2), for ``Problem.densities``."""
+        return self.density[self.label]
+
+    def spread(self):
+        """(3, h) what both add to a position in ``SHAKE_S``."""
+        return self.density[..., 0] * SHAKE_S**3 / 3 + self.density[..., 1] * SHAKE_S
+
+
+def shaking(problem: Problem) -> Problem:
+    """The problem with bodies that shake as much as they work over ``SHAKE_S``: where learning starts."""
+    both = np.array([1.0, SHAKE_S**2 / 3])
+    return replace(problem, densities=tuple(q[..., :1] * both for q in problem.densities))
 
 
 def configured(problem: Problem, values: Values) -> list[Densities]:
-    """Every interval sorted, with the densities of machine.toml: the start."""
+    """Every interval sorted, with the densities of the problem: the start."""
     out = []
     for k, variable in enumerate(problem.tie.variables):
         label = np.where(parked(problem, k), 1, 0)
         frame = fr.body_frame(variable.body)
         if variable.kind == "moving" and problem.tie.frames.edges[frame].parent == fr.WORLD:
             label[tramming(problem, values, k)] = 2
-        table = np.tile(np.asarray(variable.motion, dtype=float), (len(CLASSES), 1))
-        out.append(Densities(label, table, np.zeros_like(table)))
+        table = np.tile(problem.densities[k][:1], (len(CLASSES), 1, 1))
+        out.append(Densities(label, table, np.zeros(table.shape[:2])))
     return out
 
 
 class Increments:
-    """What the smoothed increments say of the densities, summed by variable, class and part of the motion."""
+    """What the smoothed increments say of the densities, summed by variable, class, component and cause."""
 
     def __init__(self, problem: Problem, now: list[Densities]):
         self.problem, self.now = problem, now
-        self.total = [np.zeros((len(CLASSES), 2)) for _ in now]
-        """Sums of squares of the whitened motion residuals."""
-        self.known = [np.zeros((len(CLASSES), 2)) for _ in now]
-        """``N - T``."""
+        self.total = [np.zeros_like(d.density) for d in now]
+        """Squares that each cause explains, (3, h, 2)."""
+        self.known = [np.zeros_like(d.density) for d in now]
+        """``sum tr M - T``."""
 
     def add(self, part: Part, found: Marginals) -> None:
         """The increments of a part of the log, and that to the part that follows."""
-        for k, (variable, now) in enumerate(zip(self.problem.tie.variables, self.now, strict=True)):
-            square, trace = _increments(part.problem, part.values, found, k)
+        for k, now in enumerate(self.now):
+            square, told = _shares(part.problem, part.values, found, k)
             label = now.label[part.start : part.start + len(square)]
-            halves = (
-                {1: [0, 1]} if variable.kind == "joint" else {0: [0, 1, 2, 6, 7, 8], 1: [3, 4, 5, 9, 10, 11]}
-            )
-            for half, columns in halves.items():
-                for c in range(len(CLASSES)):
-                    rows = np.flatnonzero(label == c)
-                    self.known[k][c, half] += float(np.sum(1 - trace[rows][:, columns]))
-                    self.total[k][c, half] += float(np.sum(square[rows][:, columns]))
+            for c in range(len(CLASSES)):
+                self.total[k][c] += square[label == c].sum(axis=0)
+                self.known[k][c] += told[label == c].sum(axis=0)
 
     def learned(self) -> list[Densities]:
         """One round: densities at which the marginal likelihood of these states is stationary."""
         out = []
         for k, variable in enumerate(self.problem.tie.variables):
-            old, known, total = self.now[k], self.known[k], self.total[k]
-            density = old.density.copy()
-            for half in (1,) if variable.kind == "joint" else (0, 1):
+            old, known, total = self.now[k], self.known[k].copy(), self.total[k].copy()
+            count = np.maximum(known.sum(axis=-1), 0.0)
+            # What a component alone does not tell it shares with the other two.
+            for axes in np.split(np.arange(variable.half), variable.half // 3 or 1):
                 for c in range(len(CLASSES)):
-                    if known[c, half] < ENOUGH:
-                        continue
-                    factor = np.clip(total[c, half] / known[c, half], 1 / FASTEST, FASTEST)
-                    floor = LEAST_SHARE * variable.motion[half]
-                    density[c, half] = max(density[c, half] * factor, floor)
-            out.append(Densities(old.label, density, np.maximum(known, 0.0)))
+                    few = axes[count[c, axes] < ENOUGH]
+                    known[c, few], total[c, few] = known[c, axes].sum(axis=0), total[c, axes].sum(axis=0)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                factor = np.clip(np.where(known > 0, total / known, 1.0), 1 / FASTEST, FASTEST)
+            # A cause that is not there falls by the same share in every round: two rounds at once.
+            factor[..., 1] = np.where(factor[..., 1] < 0.5, factor[..., 1] ** 2, factor[..., 1])
+            density = old.density * np.where(known.sum(axis=-1)[..., None] < ENOUGH, 1.0, factor)
+            floor = LEAST_SHARE * motion.density_of(variable.kind, variable.motion)[:, 0]
+            density[..., 0] = np.maximum(density[..., 0], floor)
+            out.append(Densities(old.label, density, count))
         return out
 
 
 def moved_by(old: list[Densities], new: list[Densities]) -> float:
-    """Largest ratio between two rounds of any density that was measured, at least 1."""
+    """Largest ratio between two rounds of what a measured density adds to a position, at least 1."""
     worst = 1.0
     for a, b in zip(old, new, strict=True):
         use = b.measured >= ENOUGH
         if np.any(use):
-            worst = max(worst, float(np.exp(np.abs(np.log(b.density[use] / a.density[use])).max())))
+            worst = max(worst, float(np.exp(np.abs(np.log(b.spread()[use] / a.spread()[use])).max())))
     return worst
 
 
@@ -133,20 +146,23 @@ def described(problem: Problem, densities: list[Densities]) -> dict:
     """For solution.json: by body and class its seconds, densities, and how many increments told them."""
     out: dict = {}
     for variable, found in zip(problem.tie.variables, densities, strict=True):
-        parts = ("rotation",) if variable.kind == "joint" else ("translation", "rotation")
-        column = {"translation": 0, "rotation": 1}
-        entry: dict = {"configured": {p: float(variable.motion[column[p]]) for p in parts}}
+        parts = {"translation": slice(0, 3), "rotation": slice(3, 6)}
+        if variable.kind == "joint":
+            parts = {"rotation": slice(0, 1)}
+        files = {"translation": variable.motion[0], "rotation": variable.motion[1]}
+        entry: dict = {"configured": {p: float(files[p]) for p in parts}}
         for c, name in enumerate(CLASSES):
             here = found.label == c
             if not np.any(here):
                 continue
             entry[name] = {"seconds": round(float(problem.dt_s[here].sum()), 2)} | {
                 p: {
-                    "density": float(f"{found.density[c, column[p]]:.4g}"),
-                    "measured": round(float(found.measured[c, column[p]]), 1),
-                    "learned": bool(found.density[c, column[p]] != variable.motion[column[p]]),
+                    "density": [float(f"{v:.4g}") for v in found.density[c, at, 0]],
+                    "shake": [float(f"{v:.4g}") for v in found.density[c, at, 1]],
+                    "measured": [round(float(n), 1) for n in found.measured[c, at]],
+                    "learned": bool(found.measured[c, at].sum() >= ENOUGH),
                 }
-                for p in parts
+                for p, at in parts.items()
             }
         out[variable.body] = entry
     return out
@@ -175,16 +191,35 @@ def spells(problem: Problem, densities: list[Densities]) -> dict[str, list[dict]
     return out
 
 
-def _increments(problem: Problem, values: Values, found: Marginals, k: int):
-    """Squares of the whitened motion residuals of a variable and their posterior variances, (E - 1, 2h) each."""
+def _shares(problem: Problem, values: Values, found: Marginals, k: int):
+    """What each density explains of the motion residuals of a variable, and how much of that was measured.
+
+    Returns two (E - 1, h, 2) arrays: squares, and expected squares less their posterior variances.
+    """
     c, at = problem.place(k)
     e, A, B = motion_residual(problem, values, k)
     assert A is not None and B is not None
-    Z = found.Z[c][:, at, at]
+    h = e.shape[1] // 2
+    Z_1, Z_2 = found.Z[c][:-1, at, at], found.Z[c][1:, at, at]
     Z_12 = -(found.G[c] @ found.Z[c][1:])[:, at, at]
-    trace = np.sum((A @ Z[:-1]) * A, axis=-1) + np.sum((B @ Z[1:]) * B, axis=-1)
-    trace += 2 * np.sum((A @ Z_12) * B, axis=-1)
-    return e**2, np.clip(trace, 0.0, 1.0)
+    AZ, BZ = A @ Z_1 + B @ np.swapaxes(Z_12, -1, -2), B @ Z_2 + A @ Z_12
+    P = np.einsum("nik,njk->nij", AZ, A) + np.einsum("nik,njk->nij", BZ, B)
+    first, second = np.arange(h), np.arange(h, 2 * h)
+    P_11, P_12, P_22 = P[:, first, first], P[:, first, second], P[:, second, second]
+    q, dt = problem.densities[k], problem.dt_s
+    W, v = motion.whitening(dt, q), q[..., 1] * dt[:, None]
+    w00, w10 = W[..., 0], W[..., 1]
+    # The whitened covariance of each cause: M = W Q W', with both together the unit matrix.
+    shake = np.stack([w00**2 * v, w00 * w10 * v, w10**2 * v])
+    share = np.stack([np.stack([1 - shake[0], -shake[1], 1 - shake[2]]), shake])  # (cause, entry, n, h)
+    e_1, e_2 = e[:, :h], e[:, h:]
+
+    def product(M, a, b, d):
+        return M[:, 0] * a + 2 * M[:, 1] * b + M[:, 2] * d
+
+    square = product(share, e_1**2, e_1 * e_2, e_2**2)
+    told = share[:, 0] + share[:, 2] - product(share, P_11, P_12, P_22)
+    return np.moveaxis(square, 0, -1), np.moveaxis(told, 0, -1)
 
 
 def parked(problem: Problem, k: int):

@@ -51,15 +51,13 @@ def log_likelihood(problem: Problem, optimum: Optimum, log_det: float) -> float:
 def log_volume(problem: Problem, values) -> float:
     """``log |d r_prior / d(x, z)|``: of the motion from epoch to epoch, and of the first epoch's weak prior.
 
-    An increment is triangular: by its own state alone it has the determinant ``|W|^h / |q| |Jr^-1|²``, and
+    An increment is triangular: by its own state alone it has the determinant ``|W| |Jr^-1|²``, and
     ``|Jr^-1|`` of a pose is the square of that of its turn, ``θ² / (2 - 2 cos θ)``. Statics are whitened: 0.
     """
     total = 0.0
-    W = motion.whitening(problem.dt_s)
     for k, variable in enumerate(problem.tie.variables):
-        half = variable.half
-        total += half * float(np.sum(np.log(W[:, 0, 0]) + np.log(W[:, 1, 1])))
-        total -= 2.0 * float(np.sum(np.log(problem.roots[k])))
+        W = motion.whitening(problem.dt_s, problem.densities[k])
+        total += float(np.sum(np.log(W[..., 0]) + np.log(W[..., 2])))
         if variable.kind == "moving":
             R = values.pose[k][:, :3, :3]
             cosine = 0.5 * (np.einsum("nij,nij->n", R[:-1], R[1:]) - 1)

@@ -1,9 +1,10 @@
-"""White noise on acceleration: what a body is likely to do between two epochs.
+"""White noise on acceleration, and on velocity: what a body is likely to do between two epochs.
 
 The prior of continuous-time trajectory estimation (Barfoot, State Estimation for Robotics, ch. 11): over ``dt`` the
 velocity changes by integrated white noise of spectral density ``q``, so
 
     e = [ log(T_1^-1 T_2) - dt w_1 ,  Jr^-1(xi) w_2 - w_1 ],   cov e = q (x) [[dt³/3, dt²/2], [dt²/2, dt]]
+                                                                     + v (x) [[dt, 0], [0, 0]]
 
 with ``xi = log(T_1^-1 T_2)``; for an angle the same with plain differences. A state can then be asked for between
 epochs too, and two sensors need not tick together.
@@ -16,26 +17,28 @@ import numpy as np
 from pipeline.geometry import se3
 
 
-def whitening(dt_s):
-    """Lower triangular ``W`` with ``W' W`` the inverse of ``[[dt³/3, dt²/2], [dt²/2, dt]]``.
+def whitening(dt_s, density):
+    """Lower triangular ``W`` of every component with ``W' W`` the inverse of its covariance over ``dt``.
 
     Parameters
     ----------
     dt_s : (n,) array
         Seconds, positive.
+    density : (n, h, 2) array
+        Of acceleration and of velocity, by component of the residual's first half.
 
     Returns
     -------
-    (n, 2, 2) array
-        Divide by the root of the spectral density.
+    (n, h, 3) array
+        ``w00, w10, w11``.
     """
-    dt_s = np.asarray(dt_s, dtype=np.float64)
-    W = np.zeros(dt_s.shape + (2, 2))
-    # Cholesky factor [[dt^1.5/sqrt3, 0], [sqrt3/2 dt^.5, dt^.5/2]], inverted by hand.
-    W[..., 0, 0] = np.sqrt(3.0) * dt_s**-1.5
-    W[..., 1, 0] = -3.0 * dt_s**-1.5
-    W[..., 1, 1] = 2.0 * dt_s**-0.5
-    return W
+    dt = np.asarray(dt_s, dtype=np.float64)[:, None]
+    a, v = density[..., 0], density[..., 1]
+    # Cholesky factor of the covariance, inverted by hand; without v it is a dt³/3, and l22 half the root of a dt.
+    l11 = np.sqrt(a * dt**3 / 3 + v * dt)
+    l21 = a * dt**2 / 2 / l11
+    l22 = np.sqrt(a * dt * (a * dt**2 / 12 + v) / (a * dt**2 / 3 + v))
+    return np.stack([1 / l11, -l21 / (l11 * l22), 1 / l22], axis=-1)
 
 
 def pose_residual(T_1, w_1, T_2, w_2, dt_s, jacobians=True):
@@ -87,29 +90,19 @@ def angle_residual(a_1, w_1, a_2, w_2, dt_s, jacobians=True):
     return e, J_1, np.broadcast_to(np.eye(2), J_1.shape)
 
 
-def root_density(kind: str, motion: tuple[float, float]):
-    """Square roots of the spectral densities, per row of the first half of the residual: (6,) or (1,)."""
-    if kind == "moving":
-        return np.sqrt(np.repeat(np.asarray(motion), 3))
-    return np.sqrt(np.array([motion[1]]))
-
-
-def whiten(blocks, W, root):
-    """``(W (x) 1/root) @ blocks`` for residuals (n, 2h) or Jacobians (n, 2h, k).
-
-    Parameters
-    ----------
-    blocks : (n, 2h, ...) array
-        Unwhitened.
-    W : (n, 2, 2) array
-        Of ``whitening``.
-    root : (h,) or (n, h) array
-        Of ``root_density``, for all intervals or for each.
-    """
-    h = root.shape[-1]
-    shape = (slice(None),) + (None,) * (blocks.ndim - 1)
-    scale = root.reshape((-1, h) + (1,) * (blocks.ndim - 2))
-    first, second = blocks[:, :h] / scale, blocks[:, h:] / scale
-    return np.concatenate(
-        [W[:, 0, 0][shape] * first, W[:, 1, 0][shape] * first + W[:, 1, 1][shape] * second], axis=1
+def density_of(kind: str, motion: tuple[float, float]):
+    """Densities by component of the first half of the residual, (6, 2) or (1, 2): of acceleration, of velocity (0)."""
+    a = (
+        np.repeat(np.asarray(motion, dtype=float), 3)
+        if kind == "moving"
+        else np.asarray(motion[1:], dtype=float)
     )
+    return np.stack([a, np.zeros_like(a)], axis=-1)
+
+
+def whiten(blocks, W):
+    """Residuals (n, 2h) or Jacobians (n, 2h, k) in their own standard deviations; `W` is (n, h, 3) of ``whitening``."""
+    h = W.shape[1]
+    w00, w10, w11 = np.moveaxis(W.reshape(W.shape + (1,) * (blocks.ndim - 2)), 2, 0)
+    first, second = blocks[:, :h], blocks[:, h:]
+    return np.concatenate([w00 * first, w10 * first + w11 * second], axis=1)

@@ -129,7 +129,7 @@ def _velocity(xi, w, c, powers):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def motion_costs(T, w, dt_s, W, root, local):
+def motion_costs(T, w, dt_s, W, local):
     """Half the squared motion residual of a moving body, added to the first epoch of each pair in ``local``."""
     xi, c, powers = np.empty(6), np.empty(4), np.empty((5, 6))
     for i in range(len(dt_s)):
@@ -138,15 +138,14 @@ def motion_costs(T, w, dt_s, W, root, local):
         _velocity(xi, w[i + 1], c, powers)
         total = 0.0
         for j in range(6):
-            e_1 = (xi[j] - dt_s[i] * w[i, j]) / root[i, j]
-            e_2 = powers[0, j] + 0.5 * powers[1, j] + c[0] * powers[2, j] + c[1] * powers[4, j]
-            e_2 = (e_2 - w[i, j]) / root[i, j]
-            total += (W[i, 0, 0] * e_1) ** 2 + (W[i, 1, 0] * e_1 + W[i, 1, 1] * e_2) ** 2
+            e_1 = xi[j] - dt_s[i] * w[i, j]
+            e_2 = powers[0, j] + 0.5 * powers[1, j] + c[0] * powers[2, j] + c[1] * powers[4, j] - w[i, j]
+            total += (W[i, j, 0] * e_1) ** 2 + (W[i, j, 1] * e_1 + W[i, j, 2] * e_2) ** 2
         local[i] += 0.5 * total
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def add_motion(T, w, dt_s, W, root, at, D, A, g):
+def add_motion(T, w, dt_s, W, at, D, A, g):
     """Add the motion residuals of a moving body to the blocks of its chain.
 
     Parameters
@@ -155,10 +154,8 @@ def add_motion(T, w, dt_s, W, root, at, D, A, g):
         Pose in the anchor and velocity in the body.
     dt_s : (E - 1,) array
         Between two epochs.
-    W : (E - 1, 2, 2) array
+    W : (E - 1, 6, 3) array
         Of ``motion.whitening``.
-    root : (E - 1, 6) array
-        Of ``motion.root_density``, between two epochs.
     at : int
         Where the body's twelve stand in the chain's block.
     D, A, g : (E, b, b), (E - 1, b, b), (E, b) arrays
@@ -198,22 +195,20 @@ def add_motion(T, w, dt_s, W, root, at, D, A, g):
                 Jl[u, j] = even - 0.5 * X[u, j]
         _product(G, Jr, GJr)
         _product(G, Jl, GJl)
-        w00, w10, w11 = W[i, 0, 0], W[i, 1, 0], W[i, 1, 1]
         for u in range(6):
-            s = 1 / root[i, u]
-            e_1 = s * (xi[u] - dt * w[i, u])
-            e_2 = powers[0, u] + 0.5 * powers[1, u] + c[0] * powers[2, u] + c[1] * powers[4, u]
-            e_2 = s * (e_2 - w[i, u])
+            w00, w10, w11 = W[i, u, 0], W[i, u, 1], W[i, u, 2]
+            e_1 = xi[u] - dt * w[i, u]
+            e_2 = powers[0, u] + 0.5 * powers[1, u] + c[0] * powers[2, u] + c[1] * powers[4, u] - w[i, u]
             e[u] = w00 * e_1
             e[6 + u] = w10 * e_1 + w11 * e_2
             for j in range(6):
-                J_1[u, j] = -s * w00 * Jl[u, j]
-                J_1[6 + u, j] = -s * (w10 * Jl[u, j] + w11 * GJl[u, j])
-                J_2[u, j] = s * w00 * Jr[u, j]
-                J_2[6 + u, j] = s * (w10 * Jr[u, j] + w11 * GJr[u, j])
-                J_2[6 + u, 6 + j] = s * w11 * Jr[u, j]
-            J_1[u, 6 + u] = -s * w00 * dt
-            J_1[6 + u, 6 + u] = -s * (w10 * dt + w11)
+                J_1[u, j] = -w00 * Jl[u, j]
+                J_1[6 + u, j] = -w10 * Jl[u, j] - w11 * GJl[u, j]
+                J_2[u, j] = w00 * Jr[u, j]
+                J_2[6 + u, j] = w10 * Jr[u, j] + w11 * GJr[u, j]
+                J_2[6 + u, 6 + j] = w11 * Jr[u, j]
+            J_1[u, 6 + u] = -w00 * dt
+            J_1[6 + u, 6 + u] = -w10 * dt - w11
         D_1, D_2, A_12 = D[i], D[i + 1], A[i]
         for n in range(12):
             en = e[n]

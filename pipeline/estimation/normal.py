@@ -55,8 +55,7 @@ def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
                 values.pose[k],
                 values.rate[k],
                 problem.dt_s,
-                motion.whitening(problem.dt_s),
-                problem.roots[k],
+                motion.whitening(problem.dt_s, problem.densities[k]),
                 local,
             )
         else:
@@ -120,8 +119,7 @@ def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
                 values.pose[k],
                 values.rate[k],
                 problem.dt_s,
-                motion.whitening(problem.dt_s),
-                problem.roots[k],
+                motion.whitening(problem.dt_s, problem.densities[k]),
                 at.start,
                 chain.D,
                 chain.A,

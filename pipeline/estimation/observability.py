@@ -267,5 +267,5 @@ def _cut(problem: Problem, keep) -> Problem:
         sensors=tuple(s for s in map(rows_of, problem.sensors) if len(s.epoch)),
         first=Values(tuple(p[keep] for p in first.pose), tuple(r[keep] for r in first.rate), first.z),
         dt_s=np.diff(epochs.time_s),
-        roots=tuple(r[between] for r in problem.roots),
+        densities=tuple(q[between] for q in problem.densities),
     )

@@ -70,7 +70,7 @@ def part_of(problem: Problem, values: Values, weights: Weights, start: int, stop
             sensors=sensors,
             first=cut(problem.first, span),
             dt_s=problem.dt_s[between],
-            roots=tuple(root[between] for root in problem.roots),
+            densities=tuple(q[between] for q in problem.densities),
             opens=start == 0,
         ),
         cut(values, span),

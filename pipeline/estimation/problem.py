@@ -44,8 +44,8 @@ class Problem:
     """The start, about which the first epoch's weak prior stands."""
     dt_s: np.ndarray
     """(E - 1,)."""
-    roots: tuple[np.ndarray, ...]
-    """Per variable: (E - 1, h) square roots of the spectral densities between its epochs."""
+    densities: tuple[np.ndarray, ...]
+    """Per variable: (E - 1, h, 2) spectral densities between its epochs, of ``motion.density_of``."""
 
     opens: bool = True
     """Whether it begins where the log begins: there the first epoch's weak prior and those of the statics count."""
@@ -137,7 +137,7 @@ def problem_of(
         first,
         np.diff(epochs.time_s),
         tuple(
-            np.tile(motion.root_density(v.kind, v.motion), (len(epochs.time_ns) - 1, 1))
+            np.tile(motion.density_of(v.kind, v.motion), (len(epochs.time_ns) - 1, 1, 1))
             for v in tie.variables
         ),
     )
@@ -230,10 +230,10 @@ def motion_residual(problem: Problem, values: Values, k: int, jacobians=True):
     T, w, dt = values.pose[k], values.rate[k], problem.dt_s
     residual = motion.pose_residual if variable.kind == "moving" else motion.angle_residual
     e, J_1, J_2 = residual(T[:-1], w[:-1], T[1:], w[1:], dt, jacobians)
-    W, root = motion.whitening(dt), problem.roots[k]
+    W = motion.whitening(dt, problem.densities[k])
     if not jacobians:
-        return motion.whiten(e, W, root), None, None
-    return motion.whiten(e, W, root), motion.whiten(J_1, W, root), motion.whiten(J_2, W, root)
+        return motion.whiten(e, W), None, None
+    return motion.whiten(e, W), motion.whiten(J_1, W), motion.whiten(J_2, W)
 
 
 def first_residual(problem: Problem, values: Values, k: int):

@@ -22,7 +22,7 @@ from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.residuals import corner_residuals
 from pipeline.estimation.values import Values
 
-ROUNDS = 3
+ROUNDS = 4
 ROUND_STEPS = 2
 """Iterations within a round: other variances move the states by a share of a sigma, which one step finds."""
 SETTLED = 1.25
@@ -61,7 +61,7 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
         moved = motion_densities.moved_by(densities, new)
         trial = replace(
             trial,
-            roots=tuple(d.roots(v.kind) for d, v in zip(new, problem.tie.variables, strict=True)),
+            densities=tuple(d.by_interval() for d in new),
             first=at.values,
         )
         densities = new

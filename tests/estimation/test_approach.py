@@ -56,9 +56,9 @@ def test_a_sample_holds_sightings_of_all_and_the_motion_within_its_stretches(pro
     np.testing.assert_array_equal(short.dt_s[within], problem.dt_s[at[:-1][within]])
     # A pair of states that fits the motion of a stretch costs nothing across a seam.
     assert np.all(short.dt_s[~within] == approach.SEAM_S) and not within.all()
-    for root, whole in zip(short.roots, problem.roots, strict=True):
-        np.testing.assert_array_equal(root[within], whole[at[:-1][within]])
-        assert np.all(root[~within] == approach.SEAM_ROOT)
+    for density, whole in zip(short.densities, problem.densities, strict=True):
+        np.testing.assert_array_equal(density[within], whole[at[:-1][within]])
+        assert np.all(density[~within] == approach.SEAM_DENSITY)
 
 
 def test_the_statics_of_a_sample_are_those_of_the_log_within_their_sigmas(problem, plain, short_stretches):

@@ -35,7 +35,7 @@ def test_it_is_the_density_of_the_measurements_with_everything_else_integrated_o
     """
     told = []
     for factor in (1.0, 9.0):
-        trial = replace(problem, roots=tuple(np.sqrt(factor) * root for root in problem.roots))
+        trial = replace(problem, densities=tuple(factor * q for q in problem.densities))
         at = optimise(trial, NO_LOSS, 30)
         r, J, _ = dense.jacobian(trial, at.values)
         measured = sum(8 * len(g.epoch) for g in trial.corners) + sum(len(s.epoch) for s in trial.sensors)

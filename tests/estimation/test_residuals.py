@@ -148,11 +148,13 @@ def test_first_epoch_prior_jacobian_matches_central_differences(at, k):
         assert np.abs(J[:, i] - numeric).max() < 1e-6
 
 
-def test_motion_whitening_inverts_the_integrated_white_noise():
-    dt = np.array([1e-4, 0.2, 600.0])
-    W = motion.whitening(dt)
-    for w, t in zip(W, dt, strict=True):
-        Q = np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]])
+@pytest.mark.parametrize("v", [0.0, 0.02])
+def test_motion_whitening_inverts_the_integrated_white_noise(v):
+    dt, a = np.array([1e-4, 0.2, 600.0]), 0.3
+    W = motion.whitening(dt, np.full((3, 1, 2), [a, v]))
+    for (w00, w10, w11), t in zip(W[:, 0], dt, strict=True):
+        Q = a * np.array([[t**3 / 3, t**2 / 2], [t**2 / 2, t]]) + v * np.array([[t, 0], [0, 0]])
+        w = np.array([[w00, 0], [w10, w11]])
         np.testing.assert_allclose(w @ Q @ w.T, np.eye(2), atol=1e-9)
 
 
@@ -167,7 +169,8 @@ def test_motion_residual_is_that_of_gtsam():
     e, _, _ = motion.pose_residual(
         T_1[None], w_1[None], T_2[None], w_2[None], np.array([dt]), jacobians=False
     )
-    ours = motion.whiten(e, motion.whitening(np.array([dt])), np.sqrt(q))
+    W = motion.whitening(np.array([dt]), np.stack([q, 0 * q], axis=-1)[None])
+    ours = motion.whiten(e, W)
     values = gtsam.Values()
     for key, T, w in ((0, T_1, w_1), (1, T_2, w_2)):
         values.insert(key, gtsam.Pose3(T))
