@@ -7,8 +7,9 @@ measured is the way from observations to the marginals of every state and static
 covariances with their own and common part, and the cutting edge's. Tables and diagnostics that `adjust` makes of
 them are not in it.
 
-Bars: 288,000 epochs in 3 minutes and 2 GB; time per epoch flat from 10,000 epochs up (within 25 %). On a machine that
-does other work too, hold the processor's seconds against them.
+Bars: 288,000 epochs in 3 minutes and 2 GB; time per epoch flat from 10,000 epochs up (within 25 %). Where the clock
+ran 1.3 times as long as the processor worked, the machine did other work too: then the processor's seconds, of one
+core, are held against the bar, and the closing line says so. The table is drawn in results/adjustment.png.
 """
 
 from __future__ import annotations
@@ -25,8 +26,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from matplotlib.figure import Figure
 
-from benchmarks._results import keep_result
+from benchmarks._results import FOLDER, keep_result
 from pipeline.config import Machine, Site
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log
@@ -40,8 +42,10 @@ from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
 from tests.estimation.simulator import MACHINE, SITE, T0_NS
 
-LENGTHS = (1_000, 10_000, 100_000, 288_000)
+LENGTHS = (1_000, 10_000, 30_000, 100_000, 288_000)
 SECONDS_BAR, MEGABYTES_BAR, FLAT_BAR = 180.0, 2000.0, 1.25
+BUSY = 1.3
+PICTURE = FOLDER / "adjustment.png"
 FRAME_S, SIGMA_PX = 0.1, 0.2
 CYCLE_S = 18.0
 BLIND = {"cab": 0.13, "stick": 0.2}
@@ -73,6 +77,11 @@ class Row:
     @property
     def cpu_seconds(self) -> float:
         return self.start_cpu_s + self.iterations_cpu_s + self.marginals_cpu_s
+
+    @property
+    def held_seconds(self) -> float:
+        """What is held against the bar: of the clock, or of the processor where the machine did other work too."""
+        return self.cpu_seconds if self.seconds > BUSY * self.cpu_seconds else self.seconds
 
     @property
     def microseconds_per_epoch(self) -> float:
@@ -150,13 +159,14 @@ def run(epochs: int) -> Row:
     """Adjust a log of this length, in this process."""
     network = network_drawn()
     _adjusted(network, corners_drawn(network, 50))  # loads what numba has compiled
-    observations = corners_drawn(network, epochs)
+    drawn = [corners_drawn(network, epochs)]
+    tags = len(drawn[0].tag)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     started = time.monotonic()
-    problem, optimum, sigma, cpu = _adjusted(network, observations)
+    problem, optimum, sigma, cpu = _adjusted(network, drawn.pop())  # the problem has them sorted
     return Row(
         len(problem.epochs.time_ns),
-        len(observations.tag),
+        tags,
         problem.statics.size + len(problem.epochs.time_ns) * sum(v.size for v in problem.tie.variables),
         optimum.iterations,
         optimum.converged,
@@ -174,7 +184,9 @@ def run(epochs: int) -> Row:
 def _adjusted(network: Network, observations: Observations):
     clock = [time.process_time()]
     tied = tie(network, observations, {})
-    problem = problem_of_log(network, tied, epochs_of(network, observations.take(tied.used), {}))
+    epochs = epochs_of(network, observations.take(tied.used), {})
+    del observations
+    problem = problem_of_log(network, tied, epochs)
     clock.append(time.process_time())
     settings = EstimationSettings()
     optimum = optimise(problem, settings.huber, settings.max_iterations)
@@ -189,11 +201,37 @@ def _adjusted(network: Network, observations: Observations):
     return problem, optimum, sigma, np.diff(clock).tolist()
 
 
+def draw(rows: list[Row], path=PICTURE) -> None:
+    """Seconds and microseconds per epoch by stage, and memory, over the length of the log."""
+    figure = Figure(figsize=(9, 3.2), layout="constrained")
+    whole, each, memory = figure.subplots(1, 3)
+    epochs = np.array([row.epochs for row in rows])
+    whole.loglog(epochs, [row.cpu_seconds for row in rows], "o-", label="all")
+    below = np.zeros(len(rows))
+    for name in ("start", "iterations", "marginals"):
+        part = np.array([getattr(row, f"{name}_cpu_s") for row in rows])
+        whole.loglog(epochs, part, ".-", linewidth=0.8, label=name)
+        above = below + 1e6 * part / epochs
+        each.fill_between(epochs, below, above, alpha=0.6, label=name)
+        below = above
+    whole.axhline(SECONDS_BAR, color="k", linestyle=":", linewidth=0.8)
+    whole.set(xlabel="epochs", ylabel="s of one core", title=f"time (bar {SECONDS_BAR:.0f} s)")
+    whole.legend(fontsize=7)
+    each.set(xscale="log", ylim=(0, None), xlabel="epochs", ylabel="us of one core", title="time per epoch")
+    each.legend(fontsize=7)
+    memory.semilogx(epochs, [row.megabytes for row in rows], "o-", label="largest")
+    memory.semilogx(epochs, [row.input_megabytes for row in rows], ".-", linewidth=0.8, label="input alone")
+    memory.axhline(MEGABYTES_BAR, color="k", linestyle=":", linewidth=0.8)
+    memory.set(ylim=(0, None), xlabel="epochs", ylabel="MB", title=f"memory (bar {MEGABYTES_BAR:.0f} MB)")
+    memory.legend(fontsize=7)
+    figure.savefig(path, dpi=80, metadata={"Software": None})
+
+
 def main() -> int:
     """Print the table and the verdict; 1 if a bar is missed."""
     parser = argparse.ArgumentParser(prog="make bench-adjustment", description=__doc__.split("\n\n")[0])
     parser.add_argument(
-        "--epochs", type=int, nargs="+", default=list(LENGTHS), help="lengths, in place of all four"
+        "--epochs", type=int, nargs="+", default=list(LENGTHS), help="lengths, in place of all five"
     )
     parser.add_argument("--one", type=int, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
@@ -219,14 +257,16 @@ def main() -> int:
     last = rows[-1]
     if last.epochs < LENGTHS[-1]:
         missed.append(f"{LENGTHS[-1]} epochs not run")
-    if last.seconds > SECONDS_BAR or last.megabytes > MEGABYTES_BAR:
+    if last.held_seconds > SECONDS_BAR or last.megabytes > MEGABYTES_BAR:
         missed.append(f"{last.epochs} epochs beyond {SECONDS_BAR:.0f} s or {MEGABYTES_BAR:.0f} MB")
     line = (
         f"adjustment: {last.epochs} epochs, {last.unknowns} unknowns, {last.iterations} iterations in "
         f"{last.seconds:.0f} s ({last.cpu_seconds:.0f} of the processor), {last.megabytes:.0f} MB, "
         f"{last.microseconds_per_epoch:.0f} us an epoch"
+        + (" (the machine was busy)" if last.held_seconds < last.seconds else "")
         + (f"; MISSED: {', '.join(missed)}" if missed else "")
     )
+    draw(rows)
     keep_result(
         "adjustment",
         [{**dataclasses.asdict(row), "us_per_epoch": row.microseconds_per_epoch} for row in rows],

@@ -77,32 +77,35 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
     """
     values, weights = problem.first, keep_all(problem, huber)
     aside: list[np.ndarray] = []
+    approached = False
     if not near:
         values, near = _approached(problem, weights, max_iterations)
+        approached = near
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
-        values, used, converged, sigmas, cost = _iterate(
-            problem, values, weights, limit, irls=0 if near or round_ else IRLS_STEPS
-        )
-        iterations += used
+        followed = round_ == 1 and approached
+        if followed:
+            # Of a long log the few pictures in doubt tell nothing about the statics.
+            values = _followed(problem, values, weights, 0)
+        else:
+            values, used, converged, sigmas, cost = _iterate(
+                problem, values, weights, limit, irls=0 if near or round_ else IRLS_STEPS
+            )
+            iterations += used
         gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
         # Doubted once, at Huber's optimum; what no flip explains comes back for good.
         aside = gates.doubtful(problem, fits) if round_ == 0 else gates.flipped(problem, values, aside)
         gated = gates.without(gated, aside)
-        if (
-            _same(gated, weights)
-            or not converged
-            or iterations >= max_iterations
-            or round_ == GATE_ROUNDS - 1
-        ):
+        settled = not followed and _same(gated, weights)
+        if settled or not converged or iterations >= max_iterations or round_ == GATE_ROUNDS - 1:
             break
         if round_ == 0:
             huber_s = Optimum(values, weights, iterations, converged, sigmas, cost)
         elif _same(gated, huber_s.weights):
             # Nothing gross, and doubted for nothing: that optimum is known.
             return replace(huber_s, iterations=iterations)
-        weights, converged = gated, False
+        weights = gated
     return Optimum(values, weights, iterations, converged, sigmas, cost)
 
 
@@ -121,11 +124,16 @@ def _approached(problem: Problem, weights: Weights, max_iterations: int) -> tupl
         found, _, converged, _, _ = _iterate(short, short.first, of_short, max_iterations, IRLS_STEPS)
         if not converged:
             return problem.first, False
-        states = approach.held(problem, found.z)
-        moved, *_ = _iterate(states, states.first, weights, NEAR_STEPS, IRLS_STEPS)
+        return _followed(problem, replace(problem.first, z=found.z), weights, IRLS_STEPS), True
     except EstimationError:
         return problem.first, False  # what a sample cannot tell, the whole log may
-    return replace(moved, z=found.z), True
+
+
+def _followed(problem: Problem, values: Values, weights: Weights, irls: int) -> Values:
+    """States that follow the statics as they are."""
+    states = approach.held(problem, values.z)
+    moved, *_ = _iterate(states, replace(values, z=states.first.z), weights, NEAR_STEPS, irls)
+    return replace(moved, z=values.z)
 
 
 def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
