@@ -68,7 +68,8 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
     max_iterations : int
         Steps of all unknowns together.
     near : bool
-        The start is a few sigmas off: the optimum of other variances.
+        The start is the optimum of other variances: no sample is asked first. Where densities fell thirtyfold, Newton's
+        steps alone were 145 sigmas off after two, and 35 followed; after two of re-weighting it is 3, and 10 follow.
 
     Raises
     ------
@@ -79,8 +80,7 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
     aside: list[np.ndarray] = []
     approached = False
     if not near:
-        values, near = _approached(problem, weights, max_iterations)
-        approached = near
+        values, approached = _approached(problem, weights, max_iterations)
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
@@ -90,7 +90,7 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
             values = _followed(problem, values, weights, 0)
         else:
             values, used, converged, sigmas, cost = _iterate(
-                problem, values, weights, limit, irls=0 if near or round_ else IRLS_STEPS
+                problem, values, weights, limit, irls=0 if approached or round_ else IRLS_STEPS
             )
             iterations += used
         gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
