@@ -13,18 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks._drawn_corners import CYCLE_S, FRAME_S, blind, noisy_corners, true_statics
 from pipeline.config import Machine, Site
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.problem import Problem
-from pipeline.geometry import camera as camera_model
 from pipeline.geometry import se3, so3
 from pipeline.network import Network, Observations, network_of
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
-from tests.estimation.simulator import MACHINE, SITE, T0_NS
+from tests.estimation.simulator import MACHINE, SITE
 
-FRAME_S, SIGMA_PX, CYCLE_S = 0.1, 0.2, 18.0
-BLIND_SHARE, BLIND_S = 0.2, 4.0
+BLIND_SHARE = 0.2
 NO_LOSS = 1e6
 """A Huber threshold that nothing reaches: plain least squares."""
 
@@ -60,32 +59,18 @@ def network_of_two() -> Network:
 def corners_of_two(network: Network, epochs: int, seed: int = 0) -> Observations:
     """Noisy corners of a log of this length; the statics differ from the files by draws from their priors."""
     rng = np.random.default_rng(seed)
-    truth = {}
-    for s in network.statics:
-        error = s.scale @ rng.standard_normal(s.scale.shape[1])
-        truth[s.name] = s.value @ se3.exp(error) if s.is_pose else s.value + error
+    truth = true_statics(rng, network)
     phase = 2 * np.pi * np.arange(epochs) * FRAME_S / CYCLE_S
-    T_world_body = {"cab": _swing(phase, 0.12, 0.02, 1.5), "arm": _swing(phase + 1, 0.15, 0.3, 1.2)}
-    hidden = np.zeros(epochs, dtype=bool)
-    for start in rng.integers(10, max(epochs, 11), round(BLIND_SHARE * epochs * FRAME_S / (0.5 * BLIND_S))):
-        hidden[start : start + rng.integers(1, round(BLIND_S / FRAME_S))] = True
-    parts = []
-    for c, camera in enumerate(network.cameras):
-        T_camera_world = se3.inverse(T_world_body[camera.body] @ truth[f"camera {camera.name} mount"])
-        size = np.array([camera.width, camera.height])
-        for k, m in enumerate(network.tag_marker):
-            T = T_camera_world @ truth[f"benchmark {network.markers[m].name} pose"]
-            p = se3.transform(T[:, None], network.tag_corners[k])
-            uv = camera_model.project(p, truth[f"camera {camera.name} intrinsics"])
-            inside = np.all((uv > 5) & (uv < size - 5), axis=(1, 2)) & (p[..., 2].min(axis=1) > 0.5)
-            rows = np.flatnonzero(inside & ~(hidden & (camera.body == "arm")))
-            parts.append((np.full(len(rows), c), np.full(len(rows), k), rows, uv[rows]))
-    camera_index, tag, frame, uv = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.lexsort([tag, camera_index, frame])
-    uv = uv[order] + SIGMA_PX * rng.standard_normal(uv.shape)
-    cov = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(order), 4, 2, 2)).copy()
-    time_ns = T0_NS + frame[order] * round(FRAME_S * 1e9)
-    return Observations(camera_index[order], tag[order], time_ns, uv, cov)
+    T_world = {
+        "world": se3.identity((epochs,)),
+        "cab": _swing(phase, 0.12, 0.02, 1.5),
+        "arm": _swing(phase + 1, 0.15, 0.3, 1.2),
+    }
+    of_arm = blind(rng, epochs, BLIND_SHARE)
+    never = np.zeros(epochs, dtype=bool)
+    return noisy_corners(
+        rng, network, truth, T_world, lambda c, m: of_arm if network.cameras[c].body == "arm" else never
+    )
 
 
 def problem_of_two(epochs: int) -> Problem:

@@ -28,28 +28,25 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from benchmarks._drawn_corners import CYCLE_S, FRAME_S, blind, noisy_corners, true_statics
 from benchmarks._results import FOLDER, keep_result
 from pipeline.config import Machine, Site
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.marginals import body_track, common_part, marginals_by_part
 from pipeline.estimation.optimise import optimise
-from pipeline.geometry import camera as camera_model
 from pipeline.geometry import se3, so3
 from pipeline.network import Network, Observations, network_of
 from pipeline.network import frames as fr
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
-from tests.estimation.simulator import MACHINE, SITE, T0_NS
+from tests.estimation.simulator import MACHINE, SITE
 
 LENGTHS = (1_000, 10_000, 30_000, 100_000, 288_000)
 SECONDS_BAR, MEGABYTES_BAR, FLAT_BAR = 180.0, 2000.0, 1.25
 BUSY = 1.3
 PICTURE = FOLDER / "adjustment.png"
-FRAME_S, SIGMA_PX = 0.1, 0.2
-CYCLE_S = 18.0
 BLIND = {"cab": 0.13, "stick": 0.2}
-BLIND_S = 4.0
 
 
 @dataclass(frozen=True)
@@ -108,10 +105,7 @@ def network_drawn() -> Network:
 def corners_drawn(network: Network, epochs: int, seed: int = 0) -> Observations:
     """Noisy corners of a log of this length; the statics differ from the files by draws from their priors."""
     rng = np.random.default_rng(seed)
-    truth = {}
-    for s in network.statics:
-        error = s.scale @ rng.standard_normal(s.scale.shape[1])
-        truth[s.name] = s.value @ se3.exp(error) if s.is_pose else s.value + error
+    truth = true_statics(rng, network)
     t = np.arange(epochs) * FRAME_S
     phase = 2 * np.pi * t / CYCLE_S
     wobble = np.cumsum(rng.standard_normal((epochs, 3)), axis=0) * 1e-5
@@ -122,37 +116,15 @@ def corners_drawn(network: Network, epochs: int, seed: int = 0) -> Observations:
     stick_way = np.stack([1.0 + 0 * t, 6.0 + 0.5 * np.sin(phase), -1.2 + 0.4 * np.cos(phase)], axis=-1)
     T_cab_stick = se3.from_rotation_translation(so3.exp(stick_turn), stick_way)
     T_world = {"world": se3.identity((epochs,)), "cab": T_world_cab, "stick": T_world_cab @ T_cab_stick}
-    blind = {body: _blind(rng, epochs, share) for body, share in BLIND.items()}
-    parts = []
-    for c, camera in enumerate(network.cameras):
-        T_camera_world = se3.inverse(T_world[camera.body] @ truth[f"camera {camera.name} mount"])
-        for k, m in enumerate(network.tag_marker):
-            marker = network.markers[m]
-            if marker.benchmark == (camera.name == "dig"):
-                continue
-            name = f"benchmark {marker.name} pose" if marker.benchmark else f"marker {marker.name} mount"
-            T = T_camera_world @ T_world[marker.body] @ truth[name]
-            p = se3.transform(T[:, None], network.tag_corners[k])
-            uv = camera_model.project(p, truth[f"camera {camera.name} intrinsics"])
-            size = np.array([camera.width, camera.height])
-            inside = np.all((uv > 5) & (uv < size - 5), axis=(1, 2)) & (p[..., 2].min(axis=1) > 0.5)
-            hidden = blind["cab"] if marker.benchmark else blind["stick"] & ~blind["cab"]  # no epoch is empty
-            rows = np.flatnonzero(inside & ~hidden)
-            parts.append((np.full(len(rows), c), np.full(len(rows), k), rows, uv[rows]))
-    camera_index, tag, frame, uv = (np.concatenate(part) for part in zip(*parts, strict=True))
-    order = np.lexsort([tag, camera_index, frame])
-    uv = uv[order] + SIGMA_PX * rng.standard_normal(uv.shape)
-    cov = np.broadcast_to(SIGMA_PX**2 * np.eye(2), (len(order), 4, 2, 2)).copy()
-    time_ns = T0_NS + frame[order] * round(FRAME_S * 1e9)
-    return Observations(camera_index[order], tag[order], time_ns, uv, cov)
+    unseen = {body: blind(rng, epochs, share) for body, share in BLIND.items()}
 
+    def hidden(c: int, m: int):
+        benchmark = network.markers[m].benchmark
+        if benchmark == (network.cameras[c].name == "dig"):
+            return None
+        return unseen["cab"] if benchmark else unseen["stick"] & ~unseen["cab"]  # no epoch is empty
 
-def _blind(rng, epochs: int, share: float) -> np.ndarray:
-    """(epochs,) bool: gaps of up to BLIND_S that fill about this share; never the first second."""
-    out = np.zeros(epochs, dtype=bool)
-    for start in rng.integers(10, max(epochs, 11), round(share * epochs * FRAME_S / (0.5 * BLIND_S))):
-        out[start : start + rng.integers(1, round(BLIND_S / FRAME_S))] = True
-    return out
+    return noisy_corners(rng, network, truth, T_world, hidden)
 
 
 def run(epochs: int) -> Row:
