@@ -11,11 +11,14 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import multiprocessing
 import sys
 import time
 from collections import Counter
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from benchmarks._draws import LOST, Outcome, draw_view, follow, refine, rms
@@ -65,8 +68,19 @@ class Row:
     """Tags with a corner over the bar."""
 
 
-def draw(seed: int, number: int, finder: TagFinder, settings: DetectionSettings) -> Draw:
+_settings = DetectionSettings()
+_finder: TagFinder | None = None
+
+
+def _begin() -> None:
+    global _finder
+    cv2.setNumThreads(1)
+    _finder = TagFinder(["tag36h11"], _settings)
+
+
+def draw(seed: int, number: int) -> Draw:
     """One tag, covered, searched and refined."""
+    assert _finder is not None
     rng = np.random.default_rng([seed, number])
     view = replace(
         draw_view(rng, rng.uniform(*SIDES_PX), rng.uniform(*TILTS_DEG)),
@@ -81,7 +95,7 @@ def draw(seed: int, number: int, finder: TagFinder, settings: DetectionSettings)
         number,
         view,
         {
-            "found": refine(view, shot, _believed(view, shot, finder, settings)),
+            "found": refine(view, shot, _believed(view, shot, _finder, _settings)),
             "predicted": refine(view, shot, predicted),
         },
     )
@@ -127,9 +141,9 @@ def main() -> int:
     )
     options = parser.parse_args()
     started = time.monotonic()
-    settings = DetectionSettings()
-    finder = TagFinder(["tag36h11"], settings)
-    draws = [draw(options.seed, number, finder, settings) for number in range(options.trials)]
+    with ProcessPoolExecutor(2, multiprocessing.get_context("spawn"), _begin) as pool:
+        numbers = range(options.trials)
+        draws = list(pool.map(draw, itertools.repeat(options.seed), numbers, chunksize=50))
     rows = []
     print(
         "start      covered      draws  tried  stand   share   RMS px   normalised   furthest   over 5 sigma"

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 from collections.abc import Iterable
 
+import cv2
 import numpy as np
 import pyapriltags
 
@@ -45,20 +46,26 @@ class TagFinder:
         Of `pipeline.config.quantities.FAMILIES`.
     settings : DetectionSettings
         Decimation, sharpening, and how many wrong bits ArUco's codes are corrected by.
+    shrink : int
+        Search the means of blocks of so many pixels each way. The library's own decimation takes single pixels and
+        reads the codes in the whole picture: on drawn pictures of 1280x960 with nine tags a search decimated by two
+        took 45 ms and one of the means of 2x2 pixels 29, by four 15 and 8, and both found the same tags.
     """
 
-    def __init__(self, families: Iterable[str], settings: DetectionSettings | None = None):
+    def __init__(self, families: Iterable[str], settings: DetectionSettings | None = None, shrink: int = 1):
         settings = settings or DetectionSettings()
+        self._shrink = shrink
         self._detectors = {family: _detector(family, settings) for family in sorted(set(families))}
 
     def find(self, grey: np.ndarray) -> Found:
         """Every tag of the families in a picture, (H, W) uint8; which of them to believe is decided elsewhere."""
-        grey = np.ascontiguousarray(grey)
+        shrink = self._shrink if min(grey.shape) >= 8 * self._shrink else 1
+        grey = _shrunk(grey, shrink)
         sightings = []
         for family, detector in self._detectors.items():
             order = CORNERS_OF_CLASSIC_PRINTS if family in CLASSIC else CORNERS_AS_APRILTAG_PRINTS
             for tag in detector.detect(grey):
-                uv = tag.corners[order] - PIXEL_ORIGIN
+                uv = shrink * tag.corners[order] - PIXEL_ORIGIN
                 sightings.append(
                     Sighting(family, int(tag.tag_id), uv, int(tag.hamming), float(tag.decision_margin))
                 )
@@ -77,13 +84,21 @@ class ArucoDetector(pyapriltags.Detector):
         )
 
 
+def _shrunk(grey: np.ndarray, shrink: int) -> np.ndarray:
+    if shrink == 1:
+        return np.ascontiguousarray(grey)
+    height, width = (length // shrink for length in grey.shape)
+    # What is left of a block at the ends is left out.
+    whole = grey[: height * shrink, : width * shrink]
+    return cv2.resize(whole, (width, height), interpolation=cv2.INTER_AREA)
+
+
 def _detector(family: str, settings: DetectionSettings) -> pyapriltags.Detector:
     decimate = settings.quad_decimate
     # The library can fit the sides of each quad to the picture before it decodes. The photometric fit does that better
     # from corners that are 0.1 px off (0.16 px in tags of 20 px), and of 47 tags on photographs one of 13 px was not
-    # read with fitted sides. Where the picture was decimated the sides are that much coarser: glances at a quarter of
-    # the resolution without the fit gave 44 codes of two wrong bits in the sample log instead of 1, and 45 of 4613 rows
-    # were lost.
+    # read with fitted sides. Where the library decimates the picture the sides are that much coarser than what the code
+    # is read from: by four without the fit gave 44 codes of two wrong bits in the sample log instead of 1.
     refine_edges = decimate > 1
     detector: pyapriltags.Detector
     if is_aruco(family):

@@ -38,13 +38,13 @@ from pipeline.detection.seen import (
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
 GLANCE_S = 1.5
-"""Between two glances: searches of the frame decimated by four. They take a twelfth of a search and miss tags under
-some 40 px; what comes from behind something and goes again within a span is found by them."""
+"""Between two glances: searches of the means of 4x4 pixels. They take a twelfth of a search and miss tags under some
+45 px; what comes from behind something and goes again within a span is found by them."""
 GLANCE_SHARE = 0.15
 """Part of the picture that was not in view at the last glance, from which on the next one is due."""
 SWEEP_SHARE = 0.6
-"""The same for sweeps: searches of the frame decimated by two. They take half of a search's time, and miss tags under
-some 20 px."""
+"""The same for sweeps: searches of the means of 2x2 pixels. They take a third of a search's time, and miss tags under
+some 25 px."""
 UNCERTAIN_S = 1.0
 """Between sweeps while the picture's motion cannot be told."""
 DECODER_TRIES = 2

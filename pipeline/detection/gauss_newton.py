@@ -19,7 +19,7 @@ from pipeline.detection.image_model import (
 )
 from pipeline.detection.integrity import noise_on_edges, point
 
-COARSE_STEP_PX = 0.3
+COARSE_STEP_PX = 0.6
 """A step this short ends the steps on a part of the pixels."""
 ROWS = 384
 LEAST_PIXELS, LEAST_ON_EDGES = 40, 30

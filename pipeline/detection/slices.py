@@ -36,8 +36,7 @@ WRONG_SIZE = "wrong size"
 MISSING = "not found again"
 LOST = "lost with a worker"
 
-GLANCE_DECIMATE = 4.0
-SWEEP_DECIMATE = 2.0
+GLANCE_SHRINK, SWEEP_SHRINK = 4, 2
 
 
 @dataclass(frozen=True)
@@ -76,9 +75,10 @@ class Finders:
         self._sweeper, self._glancer = (
             TagFinder(
                 search.families,
-                settings.model_copy(update={"quad_decimate": max(decimate, settings.quad_decimate)}),
+                settings.model_copy(update={"quad_decimate": max(settings.quad_decimate / shrink, 1.0)}),
+                shrink,
             )
-            for decimate in (SWEEP_DECIMATE, GLANCE_DECIMATE)
+            for shrink in (SWEEP_SHRINK, GLANCE_SHRINK)
         )
         self._decoder = WindowDecoder(settings)
         self._followers: dict[str, Follower] = {}
