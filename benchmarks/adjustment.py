@@ -35,6 +35,7 @@ from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.marginals import body_track, common_part, marginals_by_part
 from pipeline.estimation.optimise import optimise
+from pipeline.estimation.pull import unpulled
 from pipeline.geometry import se3, so3
 from pipeline.network import Network, Observations, network_of
 from pipeline.network import frames as fr
@@ -161,10 +162,10 @@ def _adjusted(network: Network, observations: Observations):
     problem = problem_of_log(network, tied, epochs)
     clock.append(time.process_time())
     settings = EstimationSettings()
-    optimum = optimise(problem, settings.huber, settings.max_iterations)
+    optimum = unpulled(problem, optimise(problem, settings.huber, settings.max_iterations))
     clock.append(time.process_time())
     sigma = np.empty(len(problem.epochs.time_ns))
-    for part, found in marginals_by_part(problem, optimum.values, optimum.weights):
+    for part, found in marginals_by_part(problem, optimum.values, optimum.weights, optimum.eased):
         track = body_track(part.problem, part.values, found, fr.TOOL, "tool")
         cov = (track.own + common_part(track, found.P_zz))[: part.epochs, :3, :3]
         up = track.T_world_body[: part.epochs, 2, :3]

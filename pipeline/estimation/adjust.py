@@ -14,6 +14,7 @@ from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, problem_of
 from pipeline.estimation.published import published
+from pipeline.estimation.pull import unpulled
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.estimation.repeated import WHITE, Repeated, with_offsets
 from pipeline.estimation.self_check import examine
@@ -82,9 +83,10 @@ def adjust(
             "most often the topic, field or curve of a sensor, or a tag's size or place"
         )
     if not learn or not optimum.converged:
-        return solution_of(problem, optimum, settings)
+        return solution_of(problem, unpulled(problem, optimum), settings)
     settled = settle(problem, optimum, settings, repeated)
-    solution = solution_of(settled.problem, settled.optimum, settings)
+    optimum = unpulled(settled.problem, settled.optimum)
+    solution = solution_of(settled.problem, optimum, settings)
     solution.diagnostics["learned"] = {
         "rounds": settled.rounds,
         "log_likelihood": [
@@ -124,6 +126,7 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
     )
     warnings = [
         *remarks,
+        *([optimum.remark] if optimum.remark else []),
         *problem.tie.warnings,
         *(f.sentence for f in untold if f.kind in ("gauge", "line")),
         *diagnostics.moved_statics(statics),

@@ -19,6 +19,7 @@ from pipeline.estimation import sweeps
 from pipeline.estimation.optimise import parts, pieces
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem, Weights
+from pipeline.estimation.pull import EASE
 from pipeline.estimation.values import Values
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
@@ -42,16 +43,23 @@ class Marginals:
     """Of the whole log's normal matrix, in a part's marginals too."""
 
 
-def marginals_by_part(problem: Problem, values: Values, weights: Weights) -> Iterator[tuple[Part, Marginals]]:
+def marginals_by_part(
+    problem: Problem, values: Values, weights: Weights, eased=False
+) -> Iterator[tuple[Part, Marginals]]:
     """Covariances at the optimum, without any damping, from the last part of the log to the first.
 
-    Those of the states are of the part's epochs and of its far end.
+    Those of the states are of the part's epochs and of its far end. ``eased`` is that of ``Optimum``: the statics then
+    know what the measurements tell without the motion prior.
     """
     cut = parts(problem, values, weights)
     linearised = pieces(cut)
     try:
-        reduced = sweeps.reduce(linearised, len(cut))
-        S = reduced.S
+        if eased:
+            reduced, alone = sweeps.reduce_twice(pieces(cut, ease=EASE), len(cut))
+            S = alone.S
+        else:
+            reduced = sweeps.reduce(linearised, len(cut))
+            S = reduced.S
         P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S))) if len(S) else S
     except np.linalg.LinAlgError:
         raise EstimationError(
@@ -74,9 +82,9 @@ def marginals_by_part(problem: Problem, values: Values, weights: Weights) -> Ite
         )
 
 
-def marginals(problem: Problem, values: Values, weights: Weights) -> Marginals:
+def marginals(problem: Problem, values: Values, weights: Weights, eased=False) -> Marginals:
     """Covariances of a whole log in memory: 2 GB for 100,000 epochs of two bodies."""
-    found = [(part, m) for part, m in marginals_by_part(problem, values, weights)][::-1]
+    found = [(part, m) for part, m in marginals_by_part(problem, values, weights, eased)][::-1]
     chains = range(len(problem.chains))
     return Marginals(
         tuple(np.concatenate([m.Z[c][: part.epochs] for part, m in found]) for c in chains),

@@ -99,6 +99,34 @@ def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
     C : (p, p) array
     g_z : (p,) array
     """
+    chains, C, g_z = _of_measurements(problem, values, weights, newton)
+    _add_motion(problem, values, chains)
+    return chains, C, g_z
+
+
+def linearise_twice(problem: Problem, values: Values, weights: Weights, ease: float, newton=False):
+    """The same, and the chains once more with the motion prior eased, as ``pull`` asks for.
+
+    Returns
+    -------
+    chains : list of Chain
+    eased : list of Chain
+        With densities of motion that are ``ease`` times larger, and without its residuals in the gradient.
+    C : (p, p) array
+    g_z : (p,) array
+    """
+    chains, C, g_z = _of_measurements(problem, values, weights, newton)
+    measured = [(chain.D.copy(), chain.g.copy()) for chain in chains]
+    _add_motion(problem, values, chains)
+    eased = [
+        Chain(D + (chain.D - D) / ease, chain.A / ease, g, chain.B, chain.columns)
+        for chain, (D, g) in zip(chains, measured, strict=True)
+    ]
+    return chains, eased, C, g_z
+
+
+def _of_measurements(problem: Problem, values: Values, weights: Weights, newton):
+    """What corners, readings and the priors of statics and of the first epoch make of it."""
     E, p = len(problem.epochs.time_ns), problem.statics.size
     columns = [_columns(problem, c) for c in range(len(problem.chains))]
     chains = [
@@ -111,6 +139,18 @@ def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
     for readings, alive in zip(problem.sensors, weights.sensors, strict=True):
         r, J = sensor_residuals(readings, values, problem.statics)
         _add_readings(problem, chains, C, g_z, readings.epoch, r, J, weights.huber, alive, newton)
+    if problem.opens:
+        for k in range(len(problem.tie.variables)):
+            c, at = problem.place(k)
+            e, J = first_residual(problem, values, k)
+            chains[c].D[0, at, at] += J.T @ J
+            chains[c].g[0, at] += J.T @ e
+        C += np.eye(p)
+        g_z += values.z
+    return chains, C, g_z
+
+
+def _add_motion(problem: Problem, values: Values, chains) -> None:
     for k, variable in enumerate(problem.tie.variables):
         c, at = problem.place(k)
         chain = chains[c]
@@ -133,14 +173,6 @@ def linearise(problem: Problem, values: Values, weights: Weights, newton=False):
             chain.A[:, at, at] += J_1t @ J_2
             chain.g[:-1, at] += np.einsum("nij,nj->ni", J_1t, e)
             chain.g[1:, at] += np.einsum("nij,nj->ni", J_2t, e)
-        if problem.opens:
-            e, J = first_residual(problem, values, k)
-            chain.D[0, at, at] += J.T @ J
-            chain.g[0, at] += J.T @ e
-    if problem.opens:
-        C += np.eye(p)
-        g_z += values.z
-    return chains, C, g_z
 
 
 def _way(problem: Problem, values: Values, group: Corners):

@@ -9,7 +9,8 @@ import numpy as np
 
 from pipeline.errors import EstimationError
 from pipeline.estimation import approach, gates, sweeps
-from pipeline.estimation.normal import cost_by_epoch, linearise
+from pipeline.estimation.arrow import Chain
+from pipeline.estimation.normal import cost_by_epoch, linearise, linearise_twice
 from pipeline.estimation.parts import Part, bounds, part_of
 from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
 from pipeline.estimation.values import Values
@@ -54,6 +55,10 @@ class Optimum:
     converged: bool
     last_step_sigmas: float
     cost: float
+    eased: bool = False
+    """Whether the statics are those that the measurements tell without the motion prior; see ``pull``."""
+    remark: str = ""
+    """For the reader of the report, where they should be and are not."""
 
 
 def optimise(problem: Problem, huber: float, max_iterations: int, near=False) -> Optimum:
@@ -142,9 +147,12 @@ def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
 
 
 def pieces(
-    cut: list[Part], newton=False, finish: Callable[[int, sweeps.Piece], sweeps.Piece] | None = None
+    cut: list[Part],
+    newton=False,
+    finish: Callable[[int, sweeps.Piece], sweeps.Piece] | None = None,
+    ease: float | None = None,
 ) -> sweeps.Pieces:
-    """Normal equations of the parts, when they are asked for.
+    """Normal equations of the parts, when they are asked for; ``newton`` and ``ease`` are those of ``linearise_twice``.
 
     The last few stay: sweep two begins where sweep one ends, and a short log is linearised once.
     """
@@ -153,10 +161,15 @@ def pieces(
     def piece(i: int) -> sweeps.Piece:
         if i not in kept:
             part = cut[i]
-            chains, C, g_z = linearise(part.problem, part.values, part.weights, newton)
+            at = part.problem, part.values, part.weights
+            eased: list[Chain] = []
+            if ease is None:
+                chains, C, g_z = linearise(*at, newton)
+            else:
+                chains, eased, C, g_z = linearise_twice(*at, ease, newton)
             while len(kept) >= KEPT_PARTS:
                 kept.pop(next(iter(kept)))
-            kept[i] = sweeps.Piece(tuple(chains), C, g_z, part.epochs)
+            kept[i] = sweeps.Piece(tuple(chains), C, g_z, part.epochs, eased=tuple(eased))
         return finish(i, kept[i]) if finish else kept[i]
 
     return piece
@@ -166,7 +179,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
     damping = np.zeros(stretch[-1] + 1)
-    local, prior = _cost(problem, values, weights)
+    local, prior = cost_of(problem, values, weights)
     if not np.isfinite(local.sum()):
         raise EstimationError(
             "the starting values of the adjustment cannot be evaluated; look at the detections of the first "
@@ -178,7 +191,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
     patient = True
     while used < limit and not converged:
         used += 1
-        step = _Step(problem, values, weights, held, newton=used > irls)
+        step = Step(problem, values, weights, held, newton=used > irls)
         shorten, stale = 1.0, True
         for attempt in range(TRIES):
             if stale:
@@ -187,7 +200,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
                 break
             risky, sigmas = None, step.longest
             trial = step.taken(shorten)
-            trial_local, trial_prior = _cost(problem, trial, weights)
+            trial_local, trial_prior = cost_of(problem, trial, weights)
             cost = local.sum() + prior
             change = trial_local.sum() + trial_prior - cost
             rise = np.bincount(stretch, trial_local - local)
@@ -248,10 +261,21 @@ class _Risky:
     """(stretches,) bool: where it rose."""
 
 
-class _Step:
-    """The Gauss-Newton step at one point, solved for as often as the damping changes."""
+class Step:
+    """The Gauss-Newton step at one point, solved for as often as the damping changes.
 
-    def __init__(self, problem: Problem, values: Values, weights: Weights, held, newton: bool):
+    With ``ease`` its statics' part is that of ``pull``, and the states follow.
+    """
+
+    def __init__(
+        self,
+        problem: Problem,
+        values: Values,
+        weights: Weights,
+        held,
+        newton: bool,
+        ease: float | None = None,
+    ):
         self.problem, self.values = problem, values
         self.cut = cut = parts(problem, values, weights)
         self.damping = damping = np.zeros(len(problem.epochs.time_ns))
@@ -264,14 +288,18 @@ class _Step:
                 C[held, held] += HOLD
             return replace(piece, C=C, damping=damping[cut[i].with_far_end])
 
-        self.pieces = pieces(cut, newton, finish)
+        self.pieces, self.eased = pieces(cut, newton, finish, ease), ease is not None
 
     def solve(self, damping) -> None:
         """Solve; where rounding leaves the matrix indefinite, everything is damped a little."""
         for extra in (0.0, 1e-9, 1e-6, 1e-3):
             self.damping[:] = damping + extra
             try:
-                reduced = sweeps.reduce(self.pieces, len(self.cut))
+                if self.eased:
+                    reduced, alone = sweeps.reduce_twice(self.pieces, len(self.cut))
+                    reduced = replace(reduced, dz=alone.dz, pull=alone.pull)
+                else:
+                    reduced = sweeps.reduce(self.pieces, len(self.cut))
             except np.linalg.LinAlgError:
                 continue
             break
@@ -302,7 +330,7 @@ class _Step:
         )
 
 
-def _cost(problem: Problem, values: Values, weights: Weights):
+def cost_of(problem: Problem, values: Values, weights: Weights):
     """``cost_by_epoch`` of the whole log, part by part."""
     local, prior = np.zeros(len(problem.epochs.time_ns)), 0.0
     for part in parts(problem, values, weights):

@@ -59,7 +59,7 @@ def published(problem: Problem, optimum: Optimum, max_gap_s: float) -> Published
     gathered = None if edge is None else _Edge(problem, edge)
     corner_fits: list[list[Fit]] = [[] for _ in problem.corners]
     sensor_fits: list[list[Fit]] = [[] for _ in problem.sensors]
-    for part, found in marginals_by_part(problem, optimum.values, optimum.weights):
+    for part, found in marginals_by_part(problem, optimum.values, optimum.weights, optimum.eased):
         for body in bodies:
             track = body_track(part.problem, part.values, found, body.frame, body.name)
             body.add(part, found, track)

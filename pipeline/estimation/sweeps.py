@@ -9,7 +9,7 @@ the same in one piece, and is the oracle of the tests.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg
@@ -36,6 +36,8 @@ class Piece:
     """The part's own epochs."""
     damping: np.ndarray | None = None
     """(E,) share of each epoch's own diagonal that is added to it; never in the covariance pass."""
+    eased: tuple[Chain, ...] = ()
+    """The chains with the motion prior eased, where they are asked for; see ``pull``."""
 
 
 Pieces = Callable[[int], Piece]
@@ -97,41 +99,63 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
     numpy.linalg.LinAlgError
         Something is held by nothing at all; the message names the epoch, counted within its part.
     """
-    messages: list[tuple[Message, ...]] = []
-    S = b = None
-    innovations: list[float] = []
-    log_det = 0.0
+    forward = _Forward()
+    for i in range(count):
+        forward.add(pieces(i))
+    return forward.reduced()
+
+
+def reduce_twice(pieces: Pieces, count: int) -> tuple[Reduced, Reduced]:
+    """Sweep one with the motion prior as it is, and eased; each part is asked for once."""
+    plain, eased = _Forward(), _Forward()
     for i in range(count):
         piece = pieces(i)
-        if i == 0:
-            S, b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
-            messages.append(tuple(_nothing(chain) for chain in piece.chains))
-        S += piece.C
-        b -= piece.g_z
-        innovations.append(0.0)
+        plain.add(piece)
+        eased.add(replace(piece, chains=piece.eased))
+    return plain.reduced(), eased.reduced()
+
+
+class _Forward:
+    """What sweep one has added up so far."""
+
+    def __init__(self):
+        self.messages: list[tuple[Message, ...]] = []
+        self.S = self.b = np.zeros(0)
+        self.innovations: list[float] = []
+        self.log_det = 0.0
+
+    def add(self, piece: Piece) -> None:
+        """The part that follows."""
+        if not self.messages:
+            self.S, self.b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
+            self.messages.append(tuple(_nothing(chain) for chain in piece.chains))
+        self.S += piece.C
+        self.b -= piece.g_z
+        self.innovations.append(0.0)
         following = []
-        for chain, message in zip(piece.chains, messages[i], strict=True):
+        for chain, message in zip(piece.chains, self.messages[-1], strict=True):
             W = np.concatenate([chain.B, -chain.g[..., None]], axis=-1)
             W[0] += message.W
             U, F = _factored(chain, piece, message)
             blocks.forward(U, F, W, piece.count)
             flat = W[: piece.count].reshape(-1, W.shape[-1])
             square = blocks.gram(flat, flat)
-            S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
-            b[chain.columns] -= square[:-1, -1]
-            innovations[-1] += float(square[-1, -1])
-            log_det += 2 * float(np.sum(np.log(np.einsum("nii->ni", U[: piece.count]))))
+            self.S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
+            self.b[chain.columns] -= square[:-1, -1]
+            self.innovations[-1] += float(square[-1, -1])
+            self.log_det += 2 * float(np.sum(np.log(np.einsum("nii->ni", U[: piece.count]))))
             if len(U) > piece.count:
                 following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
-        messages.append(tuple(following))
-    assert S is not None and b is not None
-    S = 0.5 * (S + S.T)
-    dz = b
-    if len(b):
-        root = scipy.linalg.cho_factor(S)
-        dz = scipy.linalg.cho_solve(root, b)
-        log_det += 2 * float(np.sum(np.log(np.diagonal(root[0]))))
-    return Reduced(S, dz, tuple(innovations), float(b @ dz), tuple(messages), log_det)
+        self.messages.append(tuple(following))
+
+    def reduced(self) -> Reduced:
+        """Solved for the statics."""
+        S, dz, log_det = 0.5 * (self.S + self.S.T), self.b, self.log_det
+        if len(self.b):
+            root = scipy.linalg.cho_factor(S)
+            dz = scipy.linalg.cho_solve(root, self.b)
+            log_det += 2 * float(np.sum(np.log(np.diagonal(root[0]))))
+        return Reduced(S, dz, tuple(self.innovations), float(self.b @ dz), tuple(self.messages), log_det)
 
 
 def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:

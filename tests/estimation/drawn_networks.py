@@ -18,6 +18,7 @@ from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log, solution_of
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.optimise import optimise
+from pipeline.estimation.pull import unpulled
 from pipeline.geometry import linkage, se3
 from pipeline.network import Network, Observations, Readings, network_of
 from pipeline.network.datum import tie
@@ -168,7 +169,7 @@ def errors(scene: Scene, carried, runs: int, trust_files: bool = False, seed: in
         assert all(kept[body] == f"camera {camera}" for body, camera in drawn.carrier.items()), kept
         epochs = epochs_of(network, drawn.observations.take(tied.used), drawn.readings)
         problem = problem_of_log(network, tied, epochs)
-        optimum = optimise(problem, settings.huber, settings.max_iterations)
+        optimum = unpulled(problem, optimise(problem, settings.huber, settings.max_iterations))
         tool = solution_of(problem, optimum, settings).body("tool")
         rows = np.flatnonzero(np.isin(tool.time_ns, drawn.frame_ns))
         k = rows[np.random.default_rng(run).integers(len(rows))]
@@ -194,4 +195,4 @@ def _static_errors(problem, optimum, truth):
             z[statics.columns[k]] = np.linalg.lstsq(statics.scale[k], off, rcond=None)[0]
     if not len(z):
         return z, np.zeros((0, 0))
-    return z - optimum.values.z, marginals(problem, optimum.values, optimum.weights).P_zz
+    return z - optimum.values.z, marginals(problem, optimum.values, optimum.weights, optimum.eased).P_zz

@@ -143,7 +143,7 @@ def test_a_risky_step_that_is_not_mended_is_taken_back(problem, plain, monkeypat
     values, weights = plain.values, plain.weights
     lengths = iter(np.geomspace(1.0, 1e9, 1000))
 
-    class Worse(iterations._Step):
+    class Worse(iterations.Step):
         """Steps away from the optimum, each longer than the one before."""
 
         def solve(self, damping):
@@ -151,7 +151,7 @@ def test_a_risky_step_that_is_not_mended_is_taken_back(problem, plain, monkeypat
             self.pull = next(lengths)
             self.deltas = [1e-4 * np.ones_like(d) for d in self.deltas]
 
-    monkeypatch.setattr(iterations, "_Step", Worse)
+    monkeypatch.setattr(iterations, "Step", Worse)
     ended, *_, cost = iterations._iterate(problem, values, weights, 3, irls=0)
     assert cost <= plain.cost * (1 + 1e-9)
     np.testing.assert_array_equal(ended.z, values.z)
