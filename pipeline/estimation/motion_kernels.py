@@ -121,7 +121,7 @@ def _add_hat(v0, v1, v2, out):
 def _inverse_jacobian(xi, c, half, J_a, J_b):
     """Blocks of ``1 + half X + c0 X² + c1 X⁴`` with ``X = ad(xi)``: J_a on the diagonal, J_b right of it.
 
-    With ``M = hat(phi) hat(rho) + hat(rho) hat(phi) = rho phi' + phi rho' - 2 d``, ``d = phi' rho`` and ``s = phi' phi``,
+    With ``M = hat(phi) hat(rho) + hat(rho) hat(phi) = rho phi' + phi rho' - 2 d``, ``d = phi' rho``, ``s = phi' phi``:
     X² has the blocks ``phi phi' - s`` and M, and X⁴ ``-s (phi phi' - s)`` and ``-s M - 2 d (phi phi' - s)``.
     """
     s = xi[3] * xi[3] + xi[4] * xi[4] + xi[5] * xi[5]

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from threading import Lock
 
 import numpy as np
 
+from pipeline import threads
 from pipeline.errors import EstimationError
 from pipeline.estimation import approach, gates, sweeps
 from pipeline.estimation.normal import cost_by_epoch, linearise
@@ -149,15 +151,19 @@ def pieces(
     The last few stay: sweep two begins where sweep one ends, and a short log is linearised once.
     """
     kept: dict[int, sweeps.Piece] = {}
+    bookkeeping = Lock()
 
     def piece(i: int) -> sweeps.Piece:
-        if i not in kept:
+        found = kept.get(i)
+        if found is None:
             part = cut[i]
             chains, C, g_z = linearise(part.problem, part.values, part.weights, newton)
-            while len(kept) >= KEPT_PARTS:
-                kept.pop(next(iter(kept)))
-            kept[i] = sweeps.Piece(tuple(chains), C, g_z, part.epochs)
-        return finish(i, kept[i]) if finish else kept[i]
+            found = sweeps.Piece(tuple(chains), C, g_z, part.epochs)
+            with bookkeeping:  # several threads ask
+                while len(kept) >= KEPT_PARTS:
+                    kept.pop(next(iter(kept)))
+                kept[i] = found
+        return finish(i, found) if finish else found
 
     return piece
 
@@ -290,10 +296,11 @@ class _Step:
 
     def taken(self, shorten: float) -> Values:
         """The values after a share of the step."""
-        moved = [
-            part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
-            for part in self.cut
-        ]
+
+        def moved_part(part: Part) -> Values:
+            return part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
+
+        moved = threads.each(moved_part, self.cut)
         return replace(
             self.values,
             pose=tuple(np.concatenate(T) for T in zip(*(v.pose for v in moved), strict=True)),
@@ -305,8 +312,9 @@ class _Step:
 def _cost(problem: Problem, values: Values, weights: Weights):
     """``cost_by_epoch`` of the whole log, part by part."""
     local, prior = np.zeros(len(problem.epochs.time_ns)), 0.0
-    for part in parts(problem, values, weights):
-        of_part, of_statics = cost_by_epoch(part.problem, part.values, part.weights)
+    cut = parts(problem, values, weights)
+    costs = threads.each(lambda part: cost_by_epoch(part.problem, part.values, part.weights), cut)
+    for part, (of_part, of_statics) in zip(cut, costs, strict=True):
         local[part.start : part.stop] = of_part[: part.epochs]
         prior += of_statics
     return local, prior

@@ -14,9 +14,9 @@ import numpy as np
 from pipeline.estimation.problem import Problem, Weights
 from pipeline.estimation.values import Values
 
-PART_EPOCHS = 2048
-"""The blocks of one part are some 10 MB, which caches hold; 288,000 epochs in one piece took 5.6 GB and a third longer.
-Smaller parts pay more for each call than for the arithmetic."""
+PART_EPOCHS = 1024
+"""The blocks of one part are some 8 MB, which caches hold, and several are in memory, as threads work ahead; 288,000
+epochs in one piece took 5.6 GB and a third longer. Smaller parts pay more for each call than for the arithmetic."""
 
 
 @dataclass(frozen=True, eq=False)

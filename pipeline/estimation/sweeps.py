@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 
+from pipeline import threads
 from pipeline.estimation import blocks
 from pipeline.estimation.arrow import Chain
 
@@ -65,6 +67,8 @@ class Reduced:
     posterior sigmas, the statics held."""
     pull: float
     """The same of the statics, ``dz' S dz``. With the innovations it makes ``-g' dx``."""
+    columns: tuple[np.ndarray, ...]
+    """(q,) per chain: which of the statics the messages' columns belong to."""
     messages: tuple[tuple[Message, ...], ...]
     """Per part and chain."""
     log_det: float
@@ -99,31 +103,27 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
     """
     messages: list[tuple[Message, ...]] = []
     S = b = None
+    columns: tuple[np.ndarray, ...] = ()
     innovations: list[float] = []
     log_det = 0.0
-    for i in range(count):
-        piece = pieces(i)
-        if i == 0:
-            S, b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
-            messages.append(tuple(_nothing(chain) for chain in piece.chains))
-        S += piece.C
-        b -= piece.g_z
-        innovations.append(0.0)
-        following = []
-        for chain, message in zip(piece.chains, messages[i], strict=True):
-            W = np.concatenate([chain.B, -chain.g[..., None]], axis=-1)
-            W[0] += message.W
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, W, piece.count)
-            flat = W[: piece.count].reshape(-1, W.shape[-1])
-            square = blocks.gram(flat, flat)
-            S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
-            b[chain.columns] -= square[:-1, -1]
-            innovations[-1] += float(square[-1, -1])
-            log_det += 2 * float(np.sum(np.log(np.einsum("nii->ni", U[: piece.count]))))
-            if len(U) > piece.count:
-                following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
-        messages.append(tuple(following))
+    with threads.crew() as crew:
+        for i, piece in enumerate(crew.each(pieces, range(count))):
+            if S is None:
+                S, b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
+                columns = tuple(chain.columns for chain in piece.chains)
+                messages.append(tuple(_nothing(chain) for chain in piece.chains))
+            S += piece.C
+            b -= piece.g_z
+            innovations.append(0.0)
+            following = []
+            of_chains = crew.each(partial(_eliminated, piece), zip(piece.chains, messages[i], strict=True))
+            for at, (square, log_det_c, message) in zip(columns, of_chains, strict=True):
+                S[np.ix_(at, at)] -= square[:-1, :-1]
+                b[at] -= square[:-1, -1]
+                innovations[-1] += float(square[-1, -1])
+                log_det += log_det_c
+                following.append(message)
+            messages.append(tuple(following) if i < count - 1 else ())
     assert S is not None and b is not None
     S = 0.5 * (S + S.T)
     dz = b
@@ -131,7 +131,19 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
         root = scipy.linalg.cho_factor(S)
         dz = scipy.linalg.cho_solve(root, b)
         log_det += 2 * float(np.sum(np.log(np.diagonal(root[0]))))
-    return Reduced(S, dz, tuple(innovations), float(b @ dz), tuple(messages), log_det)
+    return Reduced(S, dz, tuple(innovations), float(b @ dz), columns, tuple(messages), log_det)
+
+
+def _eliminated(piece: Piece, given: tuple[Chain, Message]) -> tuple[np.ndarray, float, Message]:
+    """``[W, y]' [W, y]`` of a part of a chain, its share of the determinant's logarithm, and the message at its end."""
+    chain, message = given
+    D, W = message.D.copy(), message.W.copy()
+    square = np.zeros((W.shape[1], W.shape[1]))
+    damping = np.zeros(len(chain.D)) if piece.damping is None else piece.damping
+    bad, log_det = blocks.eliminate(chain.D, chain.A, chain.B, chain.g, damping, D, W, piece.count, square)
+    if bad >= 0:
+        raise np.linalg.LinAlgError(f"block {bad} is not positive definite")
+    return np.triu(square) + np.triu(square, 1).T, log_det, Message(D, W)
 
 
 def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:
@@ -143,22 +155,27 @@ def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarr
     dx : list of (E, b) arrays
         Per chain, of the part's epochs and of the one it shares with the next.
     """
-    following: list[np.ndarray] = []
-    for i in reversed(range(len(reduced.messages) - 1)):
-        piece = pieces(i)
-        out = []
-        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
-            dz = reduced.dz[chain.columns]
-            x = -(chain.g + chain.B @ dz)[..., None]
-            x[0, :, 0] += message.W[:, -1] - message.W[:, :-1] @ dz
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, x, piece.count)
-            if len(x) > piece.count:
-                x[-1, :, 0] = following[c]
-            blocks.backward(U, F, x, piece.count)
-            out.append(x[..., 0])
-        following = [x[0].copy() for x in out]
-        yield i, out
+    following: tuple[np.ndarray | None, ...] = (None,) * len(reduced.columns)
+    back = range(len(reduced.messages) - 2, -1, -1)
+    with threads.crew() as crew:
+        for i, piece in zip(back, crew.each(pieces, back), strict=True):
+            given = zip(piece.chains, reduced.columns, reduced.messages[i], following, strict=True)
+            out = list(crew.each(partial(_moved, piece, reduced.dz), given))
+            following = tuple(x[0] for x in out)
+            yield i, out
+
+
+def _moved(piece: Piece, dz, given) -> np.ndarray:
+    """(E, b) steps of a part of a chain."""
+    chain, columns, message, following = given
+    x = -(chain.g + chain.B @ dz[chain.columns])[..., None]
+    x[0, :, 0] += message.W[:, -1] - message.W[:, :-1] @ dz[columns]
+    U, F = _factored(chain, piece, message)
+    blocks.forward(U, F, x, piece.count)
+    if following is not None:
+        x[-1, :, 0] = following
+    blocks.backward(U, F, x, piece.count)
+    return x[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,23 +192,29 @@ class Inverse:
 
 def inverses(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[Inverse]]]:
     """Sweep two of the covariances: selected inverse and border, from the last part to the first."""
-    following: list[Inverse] = []
-    for i in reversed(range(len(reduced.messages) - 1)):
-        piece = pieces(i)
-        out = []
-        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
-            Y = chain.B.copy()
-            Y[0] += message.W[:, :-1]
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, Y, piece.count)
-            Z, G = np.empty_like(U), np.empty_like(F)
-            if len(U) > piece.count:
-                Y[-1], Z[-1] = following[c].Y[0], following[c].Z[0]
-            blocks.backward(U, F, Y, piece.count)
-            blocks.selected_inverse(U, F, Z, G, piece.count)
-            out.append(Inverse(Z, G, Y))
-        following = out
-        yield i, out
+    following: tuple[Inverse | None, ...] = (None,) * len(reduced.columns)
+    back = range(len(reduced.messages) - 2, -1, -1)
+    with threads.crew() as crew:
+        for i, piece in zip(back, crew.each(pieces, back), strict=True):
+            given = zip(piece.chains, reduced.messages[i], following, strict=True)
+            out = list(crew.each(partial(_inverse, piece), given))
+            following = tuple(out)
+            yield i, out
+
+
+def _inverse(piece: Piece, given) -> Inverse:
+    """Blocks of the inverse, a part of a chain."""
+    chain, message, following = given
+    Y = chain.B.copy()
+    Y[0] += message.W[:, :-1]
+    U, F = _factored(chain, piece, message)
+    blocks.forward(U, F, Y, piece.count)
+    Z, G = np.empty_like(U), np.empty_like(F)
+    if following is not None:
+        Y[-1], Z[-1] = following.Y[0], following.Z[0]
+    blocks.backward(U, F, Y, piece.count)
+    blocks.selected_inverse(U, F, Z, G, piece.count)
+    return Inverse(Z, G, Y)
 
 
 def _nothing(chain: Chain) -> Message:
