@@ -52,6 +52,45 @@ class Statics:
         return se3.Jr(scale @ z[self.columns[index]]) @ scale
 
 
+@dataclass(frozen=True, eq=False)
+class Along(Statics):
+    """Statics whose one unknown is how far they go along a step: for whoever knows the step, a border of one column."""
+
+    of: Statics
+    z: np.ndarray
+    """(p,) where they are."""
+
+    def value(self, index: int, z):
+        return self.of.value(index, self.z)
+
+    def clock_error(self, variable: int, z) -> float:
+        return self.of.clock_error(variable, self.z)
+
+    def sensitivity(self, index: int, z):
+        scale = self.scale[index]
+        if not self.is_pose[index] or scale.shape[1] == 0:
+            return scale
+        return se3.Jr(self.of.scale[index] @ self.z[self.of.columns[index]]) @ scale
+
+
+def along(statics: Statics, z, dz) -> Along:
+    """Statics at z, that move along dz; both (p,)."""
+    moves = [len(columns) > 0 for columns in statics.columns]
+    return Along(
+        statics.base,
+        statics.is_pose,
+        tuple(
+            (scale @ dz[columns])[:, None] if m else scale
+            for scale, columns, m in zip(statics.scale, statics.columns, moves, strict=True)
+        ),
+        tuple(np.zeros(int(m), dtype=np.int64) for m in moves),
+        statics.clocks,
+        1,
+        statics,
+        z,
+    )
+
+
 def statics_of(network: Network, tied: Tie, start: Start) -> Statics:
     """The unknowns of all statics, in the network's order."""
     scale = tuple(s.scale for s in network.statics)
