@@ -101,7 +101,15 @@ def eliminate(D, A, B, g, damping, D_before, W_before, count, square):
                 for j in range(q + 1):
                     W[i, j] += W_before[i, j]
         else:
-            for m in range(b):
+            # Two rows at a time, here and below: half as much is read and written.
+            for m in range(0, b - 1, 2):
+                for i in range(b):
+                    f, h = F[m, i], F[m + 1, i]
+                    for j in range(i, b):
+                        U[i, j] -= f * F[m, j] + h * F[m + 1, j]
+                    for j in range(q + 1):
+                        W[i, j] -= f * W_last[m, j] + h * W_last[m + 1, j]
+            for m in range(b - b % 2, b):
                 for i in range(b):
                     f = F[m, i]
                     for j in range(i, b):
@@ -131,12 +139,17 @@ def eliminate(D, A, B, g, damping, D_before, W_before, count, square):
                     U[m, j] -= f * U[i, j]
                 for j in range(q + 1):
                     W[m, j] -= f * W[i, j]
-        for i in range(b):
+        for i in range(0, b - 1, 2):
+            for u in range(q + 1):
+                f, h = W[i, u], W[i + 1, u]
+                if f != 0.0 or h != 0.0:
+                    for j in range(u, q + 1):
+                        square[u, j] += f * W[i, j] + h * W[i + 1, j]
+        for i in range(b - b % 2, b):
             for u in range(q + 1):
                 f = W[i, u]
-                if f != 0.0:
-                    for j in range(u, q + 1):
-                        square[u, j] += f * W[i, j]
+                for j in range(u, q + 1):
+                    square[u, j] += f * W[i, j]
         W, W_last = W_last, W
         if k < n - 1:
             for i in range(b):
