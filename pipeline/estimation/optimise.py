@@ -12,6 +12,17 @@ import numpy as np
 from pipeline import threads
 from pipeline.errors import EstimationError
 from pipeline.estimation import approach, gates, sweeps
+from pipeline.estimation.checkpoint import (
+    FORGETFUL,
+    UNKEPT,
+    Arrays,
+    Checkpoint,
+    Iterations,
+    arrays_of,
+    arrays_of_weights,
+    values_of,
+    weights_of,
+)
 from pipeline.estimation.normal import cost_by_epoch, linearise, linearised_along
 from pipeline.estimation.parts import PART_EPOCHS, Part, bounds, joined, part_of
 from pipeline.estimation.parts import cut as cut_of
@@ -62,7 +73,14 @@ class Optimum:
     cost: float
 
 
-def optimise(problem: Problem, huber: float, max_iterations: int, near=False) -> Optimum:
+def optimise(
+    problem: Problem,
+    huber: float,
+    max_iterations: int,
+    near=False,
+    checkpoint: Checkpoint = FORGETFUL,
+    name: str = "",
+) -> Optimum:
     """The states and statics that fit everything best.
 
     Parameters
@@ -76,17 +94,33 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
     near : bool
         The start is the optimum of other variances: no sample is asked first. Where densities fell thirtyfold, Newton's
         steps alone were 145 sigmas off after two, and 35 followed; after two of re-weighting it is 3, and 10 follow.
+    checkpoint, name
+        Where finished iterations are kept, and under which name.
 
     Raises
     ------
     EstimationError
         The start cannot be evaluated.
     """
+    if (done := checkpoint.recall(f"{name} optimum")) is not None:
+        return _optimum_of(done, keep_all(problem, huber))
+    optimum = _optimised(problem, huber, max_iterations, near, checkpoint, name)
+    checkpoint.keep(f"{name} optimum", _arrays_of_optimum(optimum))
+    for kept in ("approach", *range(GATE_ROUNDS)):
+        checkpoint.forget(f"{name} {kept}")
+    return optimum
+
+
+def _optimised(problem: Problem, huber: float, max_iterations: int, near, checkpoint, name) -> Optimum:
     values, weights = problem.first, keep_all(problem, huber)
     aside: list[np.ndarray] = []
     approached = False
-    if not near:
+    if (kept := checkpoint.recall(f"{name} approach")) is not None:
+        values, approached = values_of(kept), True
+    elif not near:
         values, approached = _approached(problem, weights, max_iterations)
+        if approached:
+            checkpoint.keep(f"{name} approach", arrays_of(values))
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
@@ -99,7 +133,12 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
                 # Those whose pictures came or went; without it all took three steps, of 4, 2 and 0.02 sigmas.
                 values = _followed(problem, values, weights, 0)
             values, used, converged, sigmas, cost = _iterate(
-                problem, values, weights, limit, irls=0 if approached or round_ else IRLS_STEPS
+                problem,
+                values,
+                weights,
+                limit,
+                0 if approached or round_ else IRLS_STEPS,
+                Iterations(checkpoint, f"{name} {round_}"),
             )
             iterations += used
         gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
@@ -116,6 +155,21 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
             return replace(huber_s, iterations=iterations)
         weights = gated
     return Optimum(values, weights, iterations, converged, sigmas, cost)
+
+
+def _arrays_of_optimum(optimum: Optimum) -> Arrays:
+    state = [optimum.iterations, optimum.converged, optimum.last_step_sigmas, optimum.cost]
+    return {
+        **arrays_of(optimum.values),
+        **arrays_of_weights(optimum.weights),
+        "state": np.array(state, dtype=float),
+    }
+
+
+def _optimum_of(arrays: Arrays, like: Weights) -> Optimum:
+    iterations, converged, sigmas, cost = arrays["state"].tolist()
+    weights = weights_of(arrays, like)
+    return Optimum(values_of(arrays), weights, int(iterations), bool(converged), sigmas, np.float64(cost))
 
 
 def _same(a: Weights, b: Weights) -> bool:
@@ -194,10 +248,15 @@ def pieces(
     return piece
 
 
-def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irls: int):
+def _iterate(
+    problem: Problem, values: Values, weights: Weights, limit: int, irls: int, log: Iterations = UNKEPT
+):
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
     damping = np.zeros(stretch[-1] + 1)
+    sigmas, converged, used, patient = np.inf, False, 0, True
+    if (kept := log.recall()) is not None:
+        values, damping, used, sigmas, converged, patient = kept
     local, prior = _cost(problem, values, weights)
     if not np.isfinite(local.sum()):
         raise EstimationError(
@@ -205,9 +264,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
             "epochs and at the mounts in machine.toml"
         )
     held = unchecked_statics(problem)
-    sigmas, converged, used = np.inf, False, 0
     risky: _Risky | None = None
-    patient = True
     while used < limit and not converged:
         used += 1
         step = _Step(problem, values, weights, held, newton=used > irls)
@@ -253,6 +310,8 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
         damping[worse] = np.maximum(damping[worse], DAMPING_FIRST)
+        if risky is None:  # else it may be taken back
+            log.keep(values, damping, used, sigmas, converged, patient)
     if risky is not None and not converged:
         values, local, prior = risky.values, risky.local, risky.prior
     return values, used, converged, sigmas, local.sum() + prior
