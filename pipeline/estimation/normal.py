@@ -250,7 +250,7 @@ def _add_corners(
         rate,
         statics.value(group.intrinsics, z),
         cx + z_at.index(intrinsics[0]) if len(intrinsics) else 0,
-        statics.sensitivity(group.intrinsics, z),
+        np.ascontiguousarray(statics.sensitivity(group.intrinsics, z)),  # else it is compiled twice
         _constant(problem, values, group),
         cx + z_at.index(offset[0]) if len(offset) else 0,
         np.ascontiguousarray(K_offset).reshape(4, 2, -1),
