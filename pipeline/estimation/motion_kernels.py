@@ -14,6 +14,7 @@ _JL_INV = so3.COT[1:]
 _C2, _C4 = se3.C2_COT, se3.C4_COT
 _DC2, _DC4 = se3.DC2_COT, se3.DC4_COT
 _CLOSED_ABOVE = so3.SERIES_BELOW_RAD2
+_SMALL = 1e-3  # rad²; the first term that is left out is 1e-17 of the whole
 _FEW_TERMS_BELOW, _FEW_TERMS = 0.25, 10  # (0.25 / 4 pi²)^10 = 1e-22
 
 
@@ -68,6 +69,44 @@ def _local(T_1, T_2, xi):
     xi[0] = t0 - 0.5 * a0 + c * (py * a2 - pz * a1)
     xi[1] = t1 - 0.5 * a1 + c * (pz * a0 - px * a2)
     xi[2] = t2 - 0.5 * a2 + c * (px * a1 - py * a0)
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def retract(T, d, out):
+    """``T exp(d)`` of poses (n, 4, 4) and steps (n, 6 or more), translation first, into ``out``: ``se3.retract``.
+
+    With ``a = sin(t) / t``, ``b = (1 - cos t) / t²`` and ``c = (1 - a) / t²``: ``R = 1 + a hat(phi) + b hat(phi)²`` and
+    ``V rho = rho + b phi x rho + c phi x (phi x rho)``.
+    """
+    for i in range(len(T)):
+        r0, r1, r2, x, y, z = d[i, 0], d[i, 1], d[i, 2], d[i, 3], d[i, 4], d[i, 5]
+        s = x * x + y * y + z * z
+        if s < _SMALL:
+            a = 1 - s / 6 * (1 - s / 20 * (1 - s / 42))
+            b = 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56))
+            c = 1 / 6 - s / 120 * (1 - s / 42 * (1 - s / 72))
+        else:
+            t = np.sqrt(s)
+            half = np.sin(0.5 * t)
+            a = np.sin(t) / t
+            b = 2 * half * half / s
+            c = (1 - a) / s
+        k0, k1, k2 = y * r2 - z * r1, z * r0 - x * r2, x * r1 - y * r0
+        v0 = r0 + b * k0 + c * (y * k2 - z * k1)
+        v1 = r1 + b * k1 + c * (z * k0 - x * k2)
+        v2 = r2 + b * k2 + c * (x * k1 - y * k0)
+        e00, e11, e22 = 1 - b * (y * y + z * z), 1 - b * (x * x + z * z), 1 - b * (x * x + y * y)
+        e01, e10 = b * x * y - a * z, b * x * y + a * z
+        e02, e20 = b * x * z + a * y, b * x * z - a * y
+        e12, e21 = b * y * z - a * x, b * y * z + a * x
+        for u in range(3):
+            p0, p1, p2 = T[i, u, 0], T[i, u, 1], T[i, u, 2]
+            out[i, u, 0] = p0 * e00 + p1 * e10 + p2 * e20
+            out[i, u, 1] = p0 * e01 + p1 * e11 + p2 * e21
+            out[i, u, 2] = p0 * e02 + p1 * e12 + p2 * e22
+            out[i, u, 3] = p0 * v0 + p1 * v1 + p2 * v2 + T[i, u, 3]
+            out[i, 3, u] = 0.0
+        out[i, 3, 3] = 1.0
 
 
 @njit(cache=True, error_model="numpy")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline import threads
-from pipeline.estimation import arrow, parts, sweeps
+from pipeline.estimation import arrow, motion_kernels, parts, sweeps
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise, linearised_along
 from pipeline.estimation.optimise import optimise, pieces
@@ -19,6 +19,7 @@ from pipeline.estimation.problem import (
     motion_residual,
 )
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
+from pipeline.geometry import se3
 from tests.estimation import dense
 from tests.estimation.simulator import Options, draw
 from tests.estimation.test_adjust import _problem
@@ -194,6 +195,18 @@ def test_a_border_along_a_step_is_the_whole_border_times_the_step(at, newton):
         np.testing.assert_allclose(ours.g, right, atol=1e-11 * np.abs(right).max())
         np.testing.assert_array_equal(ours.D, chain.D)
         np.testing.assert_array_equal(ours.A, chain.A)
+
+
+def test_states_are_moved_as_the_exponential_says():
+    rng = np.random.default_rng(2)
+    angle = np.r_[0.0, 1e-12, 1e-6, 0.03, 0.0316, 0.0317, 0.1, 1.0, 3.0, np.pi, 4.0]
+    axis = rng.standard_normal((len(angle), 3))
+    axis *= (angle / np.linalg.norm(axis, axis=-1))[:, None]
+    d = np.concatenate([rng.standard_normal((len(angle), 3)), axis, np.ones((len(angle), 6))], axis=-1)
+    T = se3.exp(rng.standard_normal((len(angle), 6)))
+    moved = np.empty_like(T)
+    motion_kernels.retract(T, d, moved)
+    np.testing.assert_allclose(moved, se3.retract(T, d[:, :6]), rtol=0, atol=3e-15)
 
 
 @pytest.mark.parametrize("parts_of", [6, 9])
