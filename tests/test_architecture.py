@@ -14,7 +14,7 @@ PACKAGE = Path(__file__).resolve().parent.parent / "pipeline"
 
 # From the ground up; a module may import from floors below its own, and from its own room.
 FLOORS = (
-    {"errors", "resources"},
+    {"errors", "resources", "threads"},
     {"geometry"},
     {"config"},
     {"tables", "runs"},

@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.config.site import EstimationSettings
 from pipeline.errors import EstimationError
 from pipeline.estimation import diagnostics, observability
+from pipeline.estimation.checkpoint import FORGETFUL, Checkpoint
 from pipeline.estimation.densities import described, shaking, spells
 from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.optimise import Optimum, optimise
@@ -39,6 +40,7 @@ def adjust(
     settings: EstimationSettings | None = None,
     repeated: Repeated = WHITE,
     learn: bool = False,
+    checkpoint: Checkpoint = FORGETFUL,
 ) -> Solution:
     """Poses of every body at every epoch, and the statics, that fit everything best; with their covariances.
 
@@ -56,6 +58,8 @@ def adjust(
         What of a corner's error comes back in the next picture; to start with, if ``learn``.
     learn : bool
         Learn that and the motion densities from the log; the given ones are the start.
+    checkpoint : Checkpoint, optional
+        Keeps what is finished; if it has something of this same adjustment, that is where it goes on.
 
     Returns
     -------
@@ -75,7 +79,7 @@ def adjust(
     problem = told(problem_of_log(network, tied, epochs, repeated), settings.split)
     if learn:
         problem = shaking(problem)
-    optimum = optimise(problem, settings.huber, settings.max_iterations)
+    optimum = optimise(problem, settings.huber, settings.max_iterations, False, checkpoint, "first")
     if not optimum.converged and optimum.last_step_sigmas > LOST_SIGMAS:
         raise EstimationError(
             f"the adjustment found no answer: after {optimum.iterations} iterations it still moves by "
@@ -84,7 +88,7 @@ def adjust(
         )
     if not learn or not optimum.converged:
         return solution_of(problem, unpulled(problem, optimum), settings)
-    settled = settle(problem, optimum, settings, repeated)
+    settled = settle(problem, optimum, settings, repeated, checkpoint)
     optimum = unpulled(settled.problem, settled.optimum)
     solution = solution_of(settled.problem, optimum, settings)
     solution.diagnostics["learned"] = {

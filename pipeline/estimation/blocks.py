@@ -59,6 +59,113 @@ def factor(D, A, count):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def eliminate(D, A, B, g, damping, D_before, W_before, count, square):
+    """Factor and ``forward`` in one, of which only the sums stay: nothing but two blocks is ever written.
+
+    Parameters
+    ----------
+    D, A, B, g : (n, b, b), (n - 1, b, b), (n, b, q), (n, b) arrays
+        Of ``arrow.Chain``.
+    damping : (n,) array
+        Share of each block's own diagonal that is added to it.
+    D_before, W_before : (b, b), (b, q + 1) arrays
+        What those before say of the first block; in their place comes what is said of the one after ``count``.
+    count : int
+        Blocks that are eliminated.
+    square : (q + 1, q + 1) array
+        ``sum W_k' W_k`` with ``W_k = U_k^-T [B_k, -g_k]`` is added to it.
+
+    Returns
+    -------
+    bad : int
+        The first block that is not positive definite, or -1.
+    log_det : float
+        Of the eliminated blocks' factor.
+    """
+    n, b, q = B.shape
+    U, F = np.empty((b, b)), np.empty((b, b))
+    W, W_last = np.empty((b, q + 1)), np.empty((b, q + 1))
+    log_det = 0.0
+    for k in range(n):
+        for i in range(b):
+            for j in range(b):
+                U[i, j] = D[k, i, j]
+            U[i, i] *= 1.0 + damping[k]
+            for j in range(q):
+                W[i, j] = B[k, i, j]
+            W[i, q] = -g[k, i]
+        if k == 0:
+            for i in range(b):
+                for j in range(b):
+                    U[i, j] += D_before[i, j]
+                for j in range(q + 1):
+                    W[i, j] += W_before[i, j]
+        else:
+            # Two rows at a time, here and below: half as much is read and written.
+            for m in range(0, b - 1, 2):
+                for i in range(b):
+                    f, h = F[m, i], F[m + 1, i]
+                    for j in range(i, b):
+                        U[i, j] -= f * F[m, j] + h * F[m + 1, j]
+                    for j in range(q + 1):
+                        W[i, j] -= f * W_last[m, j] + h * W_last[m + 1, j]
+            for m in range(b - b % 2, b):
+                for i in range(b):
+                    f = F[m, i]
+                    for j in range(i, b):
+                        U[i, j] -= f * F[m, j]
+                    for j in range(q + 1):
+                        W[i, j] -= f * W_last[m, j]
+        if k == count:
+            for i in range(b):
+                for j in range(i, b):
+                    D_before[i, j] = D_before[j, i] = U[i, j]
+                for j in range(q + 1):
+                    W_before[i, j] = W[i, j]
+            break
+        for i in range(b):
+            pivot = U[i, i]
+            if not pivot > 0.0:
+                return k, log_det
+            log_det += np.log(pivot)
+            r = 1.0 / np.sqrt(pivot)
+            for j in range(i, b):
+                U[i, j] *= r
+            for j in range(q + 1):
+                W[i, j] *= r
+            for m in range(i + 1, b):
+                f = U[i, m]
+                for j in range(m, b):
+                    U[m, j] -= f * U[i, j]
+                for j in range(q + 1):
+                    W[m, j] -= f * W[i, j]
+        for i in range(0, b - 1, 2):
+            for u in range(q + 1):
+                f, h = W[i, u], W[i + 1, u]
+                if f != 0.0 or h != 0.0:
+                    for j in range(u, q + 1):
+                        square[u, j] += f * W[i, j] + h * W[i + 1, j]
+        for i in range(b - b % 2, b):
+            for u in range(q + 1):
+                f = W[i, u]
+                for j in range(u, q + 1):
+                    square[u, j] += f * W[i, j]
+        W, W_last = W_last, W
+        if k < n - 1:
+            for i in range(b):
+                for j in range(b):
+                    F[i, j] = A[k, i, j]
+                for m in range(i):
+                    f = U[m, i]
+                    for j in range(b):
+                        F[i, j] -= f * F[m, j]
+                r = 1.0 / U[i, i]
+                for j in range(b):
+                    F[i, j] *= r
+    return -1, log_det
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def forward(U, F, B, count):
     """``W_k = U_k^-T (B_k - F_k-1' W_k-1)``, in place of B (n, b, r); the block after ``count`` without ``U_k^-T``."""
     n, b, r = B.shape

@@ -188,7 +188,7 @@ def add_corners(
     m, cx, cz = len(sign), len(x_at), len(border_at)
     c = cx + cz
     wi, wc = K_intrinsics.shape[1], K_constant.shape[2]
-    f0, f1, c4, c5, c6, c7, c8 = (
+    fx0, fy0, c4, c5, c6, c7, c8 = (
         intrinsics[0],
         intrinsics[1],
         intrinsics[4],
@@ -203,6 +203,9 @@ def add_corners(
     rows = np.empty((8, c))
     H = np.empty((c, c))
     grad = np.empty(c)
+    plain = np.zeros(m, dtype=np.bool_)  # a body's own error, component by component
+    for s in range(m):
+        plain[s] = width[s] == 6 and np.all(K[s, :, :6] == np.eye(6))
     for i in range(len(epoch)):
         _walk(i, T, sign, R, t)
         used = 0
@@ -221,10 +224,10 @@ def add_corners(
             radial = 1 + r2 * (c4 + r2 * (c5 + r2 * c8))
             slope = 2 * (c4 + r2 * (2 * c5 + r2 * 3 * c8))
             mixed = slope * x * y + 2 * c6 * x + 2 * c7 * y
-            ux = f0 * (radial + slope * x * x + 2 * c6 * y + 6 * c7 * x) / z
-            uy = f0 * mixed / z
-            vx = f1 * mixed / z
-            vy = f1 * (radial + slope * y * y + 6 * c6 * y + 2 * c7 * x) / z
+            ux = fx0 * (radial + slope * x * x + 2 * c6 * y + 6 * c7 * x) / z
+            uy = fx0 * mixed / z
+            vx = fy0 * mixed / z
+            vy = fy0 * (radial + slope * y * y + 6 * c6 * y + 2 * c7 * x) / z
             uz = -(ux * x + uy * y)
             vz = -(vx * x + vy * y)
             for e in range(2):  # observed minus predicted
@@ -252,10 +255,15 @@ def add_corners(
                     J[e, 4] = J[e, 0] * q[2] - J[e, 2] * q[0]
                     J[e, 5] = J[e, 1] * q[0] - J[e, 0] * q[1]
                     at = column[s]
-                    for b in range(6):
-                        f = J[e, b]
+                    if plain[s]:
+                        for b in range(6):
+                            a[e, at + b] += J[e, b]
+                    else:
+                        j0, j1, j2, j3, j4, j5 = J[e, 0], J[e, 1], J[e, 2], J[e, 3], J[e, 4], J[e, 5]
                         for j in range(width[s]):
-                            a[e, at + j] += f * K[s, b, j]
+                            a[e, at + j] += (j0 * K[s, 0, j] + j1 * K[s, 1, j] + j2 * K[s, 2, j]) + (
+                                j3 * K[s, 3, j] + j4 * K[s, 4, j] + j5 * K[s, 5, j]
+                            )
                     if clock[s] >= 0:
                         a[e, clock[s]] += J[e, 5] * K_clock[s] * rate[s, i if rate.shape[1] > 1 else 0]
             if wi > 0:
@@ -264,10 +272,10 @@ def add_corners(
                 for e in range(2):
                     lu, lv = -L[e, 0], -L[e, 1]
                     J_i[e, 0], J_i[e, 1], J_i[e, 2], J_i[e, 3] = lu * xd, lv * yd, lu, lv
-                    fx, fy = lu * f0 * x + lv * f1 * y, 2 * x * y
+                    fx, fy = lu * fx0 * x + lv * fy0 * y, 2 * x * y
                     J_i[e, 4], J_i[e, 5], J_i[e, 8] = fx * r2, fx * r2 * r2, fx * r2 * r2 * r2
-                    J_i[e, 6] = lu * f0 * fy + lv * f1 * (r2 + 2 * y * y)
-                    J_i[e, 7] = lu * f0 * (r2 + 2 * x * x) + lv * f1 * fy
+                    J_i[e, 6] = lu * fx0 * fy + lv * fy0 * (r2 + 2 * y * y)
+                    J_i[e, 7] = lu * fx0 * (r2 + 2 * x * x) + lv * fy0 * fy
                     for b in range(9):
                         f = J_i[e, b]
                         for j in range(wi):
@@ -296,12 +304,17 @@ def add_corners(
                     used += 1
         if used == 0:
             continue
-        H[:] = 0.0
-        for n in range(used):
-            for u in range(c):
-                f = rows[n, u]
-                for j in range(u, c):
-                    H[u, j] += f * rows[n, j]
+        for n in range(used, 8):
+            for j in range(c):
+                rows[n, j] = 0.0
+        # All eight rows at once: each place of H is written once.
+        for u in range(c):
+            f0, f1, f2, f3 = rows[0, u], rows[1, u], rows[2, u], rows[3, u]
+            f4, f5, f6, f7 = rows[4, u], rows[5, u], rows[6, u], rows[7, u]
+            for j in range(u, c):
+                H[u, j] = ((f0 * rows[0, j] + f1 * rows[1, j]) + (f2 * rows[2, j] + f3 * rows[3, j])) + (
+                    (f4 * rows[4, j] + f5 * rows[5, j]) + (f6 * rows[6, j] + f7 * rows[7, j])
+                )
         k_e = epoch[i]
         for u in range(cx):
             g[k_e, x_at[u]] += grad[u]

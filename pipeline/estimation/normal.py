@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pipeline.estimation import blocks, corner_kernels, motion, motion_kernels
@@ -16,7 +18,7 @@ from pipeline.estimation.problem import (
     motion_residual,
 )
 from pipeline.estimation.residuals import TURN_COLUMN, Corners, Jacobians, sensor_residuals
-from pipeline.estimation.values import Values
+from pipeline.estimation.values import Values, along
 
 
 def cost_by_epoch(problem: Problem, values: Values, weights: Weights):
@@ -175,6 +177,17 @@ def _add_motion(problem: Problem, values: Values, chains) -> None:
             chain.g[1:, at] += np.einsum("nij,nj->ni", J_2t, e)
 
 
+def linearised_along(problem: Problem, values: Values, weights: Weights, dz, newton=False) -> list[Chain]:
+    """Chains of ``linearise`` without a border, their gradient ``g + B dz``: a step of the states once dz is known.
+
+    A corner's rows then have one column of all statics in place of some twenty; with all of them it took three times as
+    long.
+    """
+    moved = replace(problem, statics=along(problem.statics, values.z, dz))
+    chains, _, _ = linearise(moved, replace(values, z=np.zeros(1)), weights, newton)
+    return [replace(c, g=c.g + c.B.sum(axis=-1), B=c.B[..., :0], columns=c.columns[:0]) for c in chains]
+
+
 def _way(problem: Problem, values: Values, group: Corners):
     """Edges of a group's path as the kernels take them: ``T_parent_child`` (m, n or 1, 4, 4), and signs (m,)."""
     edges = [values.edge_pose(problem.statics, s.edge, group.epoch) for s in group.path]
@@ -269,7 +282,7 @@ def _add_corners(
         rate,
         statics.value(group.intrinsics, z),
         cx + z_at.index(intrinsics[0]) if len(intrinsics) else 0,
-        statics.sensitivity(group.intrinsics, z),
+        np.ascontiguousarray(statics.sensitivity(group.intrinsics, z)),  # else it is compiled twice
         _constant(problem, values, group),
         cx + z_at.index(offset[0]) if len(offset) else 0,
         np.ascontiguousarray(K_offset).reshape(4, 2, -1),
@@ -306,7 +319,7 @@ def _columns(problem: Problem, chain: int):
             if sensor.linkage is not None:
                 met.add(sensor.linkage)
     parts = [problem.statics.columns[s] for s in sorted(met)]
-    return np.concatenate(parts) if parts else np.array([], dtype=np.int64)
+    return np.unique(np.concatenate(parts)) if parts else np.array([], dtype=np.int64)
 
 
 def _add_readings(problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, k: float, alive, newton) -> None:
@@ -318,10 +331,17 @@ def _add_readings(problem: Problem, chains, C, g_z, epoch, r, J: Jacobians, k: f
     parts = [*J.variables.values(), *J.statics.values()]
     A = np.where(use[..., None], np.concatenate(parts, axis=-1), 0.0)[:, 0]
     r = np.where(use, r, 0.0)[:, 0]
-    bent = np.where(weight < 1, 0.0, weight) if newton else weight  # past the threshold the loss is a line
-    wA, wr = bent * A, weight[:, 0] * r
     z = np.concatenate([problem.statics.columns[s] for s in J.statics]) if J.statics else np.array([], int)
     count = A.shape[-1] - len(z)
+    if len(np.unique(z)) < len(z):  # of ``values.Along``: one column of several statics
+        z, column = np.unique(z, return_inverse=True)
+        merged = np.zeros((len(A), count + len(z)))
+        merged[:, :count] = A[:, :count]
+        for j, to in enumerate(column.tolist()):
+            merged[:, count + to] += A[:, count + j]
+        A = merged
+    bent = np.where(weight < 1, 0.0, weight) if newton else weight  # past the threshold the loss is a line
+    wA, wr = bent * A, weight[:, 0] * r
     C[np.ix_(z, z)] += blocks.gram(A[:, count:], wA[:, count:])
     g_z[z] += A[:, count:].T @ wr
     places = {v: problem.place(v) for v in J.variables}

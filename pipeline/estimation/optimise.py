@@ -4,14 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
+from threading import Lock
 
 import numpy as np
 
+from pipeline import threads
 from pipeline.errors import EstimationError
 from pipeline.estimation import approach, gates, sweeps
 from pipeline.estimation.arrow import Chain
-from pipeline.estimation.normal import cost_by_epoch, linearise, linearise_twice
-from pipeline.estimation.parts import Part, bounds, part_of
+from pipeline.estimation.checkpoint import (
+    FORGETFUL,
+    UNKEPT,
+    Arrays,
+    Checkpoint,
+    Iterations,
+    arrays_of,
+    arrays_of_weights,
+    values_of,
+    weights_of,
+)
+from pipeline.estimation.normal import cost_by_epoch, linearise, linearise_twice, linearised_along
+from pipeline.estimation.parts import PART_EPOCHS, Part, bounds, joined, part_of
+from pipeline.estimation.parts import cut as cut_of
 from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
 from pipeline.estimation.values import Values
 
@@ -25,6 +40,8 @@ STEP_SIGMAS = 0.05
 """Converged when no unknown moves by more of its posterior sigma; see ``sweeps.Reduced.longest``."""
 NEAR_STEPS = 3
 """Steps of the states with the statics of a sample: 1e5, 500 and 10 sigmas, and 5 are left to the statics."""
+SPAN, MARGIN = 3 * PART_EPOCHS, 128
+"""Epochs that follow the statics together, and those on either side that are adjusted with them and not kept."""
 IRLS_STEPS = 2
 """First steps with re-weighting only: far from the optimum most corners are beyond the threshold, and without
 their curvature along the residual nothing would hold the step."""
@@ -61,7 +78,14 @@ class Optimum:
     """For the reader of the report, where they should be and are not."""
 
 
-def optimise(problem: Problem, huber: float, max_iterations: int, near=False) -> Optimum:
+def optimise(
+    problem: Problem,
+    huber: float,
+    max_iterations: int,
+    near=False,
+    checkpoint: Checkpoint = FORGETFUL,
+    name: str = "",
+) -> Optimum:
     """The states and statics that fit everything best.
 
     Parameters
@@ -75,17 +99,33 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
     near : bool
         The start is the optimum of other variances: no sample is asked first. Where densities fell thirtyfold, Newton's
         steps alone were 145 sigmas off after two, and 35 followed; after two of re-weighting it is 3, and 10 follow.
+    checkpoint, name
+        Where finished iterations are kept, and under which name.
 
     Raises
     ------
     EstimationError
         The start cannot be evaluated.
     """
+    if (done := checkpoint.recall(f"{name} optimum")) is not None:
+        return _optimum_of(done, keep_all(problem, huber))
+    optimum = _optimised(problem, huber, max_iterations, near, checkpoint, name)
+    checkpoint.keep(f"{name} optimum", _arrays_of_optimum(optimum))
+    for kept in ("approach", *range(GATE_ROUNDS)):
+        checkpoint.forget(f"{name} {kept}")
+    return optimum
+
+
+def _optimised(problem: Problem, huber: float, max_iterations: int, near, checkpoint, name) -> Optimum:
     values, weights = problem.first, keep_all(problem, huber)
     aside: list[np.ndarray] = []
     approached = False
-    if not near:
+    if (kept := checkpoint.recall(f"{name} approach")) is not None:
+        values, approached = values_of(kept), True
+    elif not near:
         values, approached = _approached(problem, weights, max_iterations)
+        if approached:
+            checkpoint.keep(f"{name} approach", arrays_of(values))
     iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
     for round_ in range(GATE_ROUNDS):
         limit = max_iterations - iterations
@@ -94,8 +134,16 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
             # Of a long log the few pictures in doubt tell nothing about the statics.
             values = _followed(problem, values, weights, 0)
         else:
+            if round_ and approached:
+                # Those whose pictures came or went; without it all took three steps, of 4, 2 and 0.02 sigmas.
+                values = _followed(problem, values, weights, 0)
             values, used, converged, sigmas, cost = _iterate(
-                problem, values, weights, limit, irls=0 if approached or round_ else IRLS_STEPS
+                problem,
+                values,
+                weights,
+                limit,
+                0 if approached or round_ else IRLS_STEPS,
+                Iterations(checkpoint, f"{name} {round_}"),
             )
             iterations += used
         gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
@@ -112,6 +160,21 @@ def optimise(problem: Problem, huber: float, max_iterations: int, near=False) ->
             return replace(huber_s, iterations=iterations)
         weights = gated
     return Optimum(values, weights, iterations, converged, sigmas, cost)
+
+
+def _arrays_of_optimum(optimum: Optimum) -> Arrays:
+    state = [optimum.iterations, optimum.converged, optimum.last_step_sigmas, optimum.cost]
+    return {
+        **arrays_of(optimum.values),
+        **arrays_of_weights(optimum.weights),
+        "state": np.array(state, dtype=float),
+    }
+
+
+def _optimum_of(arrays: Arrays, like: Weights) -> Optimum:
+    iterations, converged, sigmas, cost = arrays["state"].tolist()
+    weights = weights_of(arrays, like)
+    return Optimum(values_of(arrays), weights, int(iterations), bool(converged), sigmas, np.float64(cost))
 
 
 def _same(a: Weights, b: Weights) -> bool:
@@ -135,10 +198,29 @@ def _approached(problem: Problem, weights: Weights, max_iterations: int) -> tupl
 
 
 def _followed(problem: Problem, values: Values, weights: Weights, irls: int) -> Values:
-    """States that follow the statics as they are."""
+    """States that follow the statics as they are.
+
+    Given the statics a state knows nothing of those much before and after it, so spans of the log are adjusted each on
+    its own, as if the log ended ``MARGIN`` epochs beyond: each is linearised once per step, and threads share them.
+    """
     states = approach.held(problem, values.z)
-    moved, *_ = _iterate(states, replace(values, z=states.first.z), weights, NEAR_STEPS, irls)
-    return replace(moved, z=values.z)
+    z, values = values.z, replace(values, z=states.first.z)
+    E = len(problem.epochs.time_ns)
+
+    def moved(span: tuple[int, int]) -> Values:
+        a, b = span
+        part = part_of(states, values, weights, max(a - MARGIN, 0), min(b + MARGIN, E))
+        own = slice(a - part.start, b - part.start)
+        try:
+            # Its first epoch has the weak prior of a log's: a body that the span does not show stays where it is.
+            alone = replace(part.problem, first=part.values, opens=True)
+            found, *_ = _iterate(alone, part.values, part.weights, NEAR_STEPS, irls)
+        except EstimationError:
+            found = part.values  # the whole log may hold what a span does not
+        return cut_of(found, own)
+
+    found = threads.each(moved, bounds(problem, SPAN))
+    return replace(joined(found), z=z)
 
 
 def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
@@ -157,9 +239,11 @@ def pieces(
     The last few stay: sweep two begins where sweep one ends, and a short log is linearised once.
     """
     kept: dict[int, sweeps.Piece] = {}
+    bookkeeping = Lock()
 
     def piece(i: int) -> sweeps.Piece:
-        if i not in kept:
+        found = kept.get(i)
+        if found is None:
             part = cut[i]
             at = part.problem, part.values, part.weights
             eased: list[Chain] = []
@@ -167,18 +251,25 @@ def pieces(
                 chains, C, g_z = linearise(*at, newton)
             else:
                 chains, eased, C, g_z = linearise_twice(*at, ease, newton)
-            while len(kept) >= KEPT_PARTS:
-                kept.pop(next(iter(kept)))
-            kept[i] = sweeps.Piece(tuple(chains), C, g_z, part.epochs, eased=tuple(eased))
-        return finish(i, kept[i]) if finish else kept[i]
+            found = sweeps.Piece(tuple(chains), C, g_z, part.epochs, eased=tuple(eased))
+            with bookkeeping:  # several threads ask
+                while len(kept) >= KEPT_PARTS:
+                    kept.pop(next(iter(kept)))
+                kept[i] = found
+        return finish(i, found) if finish else found
 
     return piece
 
 
-def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irls: int):
+def _iterate(
+    problem: Problem, values: Values, weights: Weights, limit: int, irls: int, log: Iterations = UNKEPT
+):
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
     damping = np.zeros(stretch[-1] + 1)
+    sigmas, converged, used, patient = np.inf, False, 0, True
+    if (kept := log.recall()) is not None:
+        values, damping, used, sigmas, converged, patient = kept
     local, prior = cost_of(problem, values, weights)
     if not np.isfinite(local.sum()):
         raise EstimationError(
@@ -186,9 +277,7 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
             "epochs and at the mounts in machine.toml"
         )
     held = unchecked_statics(problem)
-    sigmas, converged, used = np.inf, False, 0
     risky: _Risky | None = None
-    patient = True
     while used < limit and not converged:
         used += 1
         step = Step(problem, values, weights, held, newton=used > irls)
@@ -234,6 +323,8 @@ def _iterate(problem: Problem, values: Values, weights: Weights, limit: int, irl
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
         damping[worse] = np.maximum(damping[worse], DAMPING_FIRST)
+        if risky is None:  # else it may be taken back
+            log.keep(values, damping, used, sigmas, converged, patient)
     if risky is not None and not converged:
         values, local, prior = risky.values, risky.local, risky.prior
     return values, used, converged, sigmas, local.sum() + prior
@@ -290,6 +381,14 @@ class Step:
 
         self.pieces, self.eased = pieces(cut, newton, finish, ease), ease is not None
 
+        def follow(dz, i: int) -> sweeps.Piece:
+            of = cut[i]
+            chains = linearised_along(of.problem, of.values, of.weights, dz, newton)
+            return sweeps.Piece(tuple(chains), dz[:0], dz[:0], of.epochs, damping[of.with_far_end])
+
+        # A short log is linearised once. Without a border there is nothing to spare either.
+        self.follow = None if len(cut) <= KEPT_PARTS or not problem.statics.size else follow
+
     def solve(self, damping) -> None:
         """Solve; where rounding leaves the matrix indefinite, everything is damped a little."""
         for extra in (0.0, 1e-9, 1e-6, 1e-3):
@@ -311,30 +410,28 @@ class Step:
         self.dz, self.longest, self.pull = reduced.dz, reduced.longest, reduced.pull
         E = len(self.problem.epochs.time_ns)
         self.deltas = [np.empty((E, v.size)) for v in self.problem.tie.variables]
-        for i, dx in sweeps.steps(self.pieces, reduced):
+        following = self.pieces if self.follow is None else partial(self.follow, reduced.dz)
+        for i, dx in sweeps.steps(following, reduced):
             part = self.cut[i]
             for delta, of_part in zip(self.deltas, deltas_of(self.problem, dx), strict=True):
                 delta[part.start : part.stop] = of_part[: part.epochs]
 
     def taken(self, shorten: float) -> Values:
         """The values after a share of the step."""
-        moved = [
-            part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
-            for part in self.cut
-        ]
-        return replace(
-            self.values,
-            pose=tuple(np.concatenate(T) for T in zip(*(v.pose for v in moved), strict=True)),
-            rate=tuple(np.concatenate(w) for w in zip(*(v.rate for v in moved), strict=True)),
-            z=self.values.z + shorten * self.dz,
-        )
+
+        def moved_part(part: Part) -> Values:
+            return part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
+
+        moved = joined(threads.each(moved_part, self.cut))
+        return replace(moved, z=self.values.z + shorten * self.dz)
 
 
 def cost_of(problem: Problem, values: Values, weights: Weights):
     """``cost_by_epoch`` of the whole log, part by part."""
     local, prior = np.zeros(len(problem.epochs.time_ns)), 0.0
-    for part in parts(problem, values, weights):
-        of_part, of_statics = cost_by_epoch(part.problem, part.values, part.weights)
+    cut = parts(problem, values, weights)
+    costs = threads.each(lambda part: cost_by_epoch(part.problem, part.values, part.weights), cut)
+    for part, (of_part, of_statics) in zip(cut, costs, strict=True):
         local[part.start : part.stop] = of_part[: part.epochs]
         prior += of_statics
     return local, prior

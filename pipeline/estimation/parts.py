@@ -14,9 +14,9 @@ import numpy as np
 from pipeline.estimation.problem import Problem, Weights
 from pipeline.estimation.values import Values
 
-PART_EPOCHS = 2048
-"""The blocks of one part are some 10 MB, which caches hold; 288,000 epochs in one piece took 5.6 GB and a third longer.
-Smaller parts pay more for each call than for the arithmetic."""
+PART_EPOCHS = 1024
+"""The blocks of one part are some 8 MB, which caches hold, and several are in memory, as threads work ahead; 288,000
+epochs in one piece took 5.6 GB and a third longer. Smaller parts pay more for each call than for the arithmetic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +71,7 @@ def part_of(problem: Problem, values: Values, weights: Weights, start: int, stop
             first=cut(problem.first, span),
             dt_s=problem.dt_s[between],
             densities=tuple(q[between] for q in problem.densities),
-            opens=start == 0,
+            opens=problem.opens and start == 0,
         ),
         cut(values, span),
         replace(weights, corners=kept, sensors=read),
@@ -94,3 +94,12 @@ def _rows(groups, alive, start: int, stop: int):
 def cut(values: Values, span: slice) -> Values:
     """The states of some epochs, with all statics."""
     return replace(values, pose=tuple(T[span] for T in values.pose), rate=tuple(w[span] for w in values.rate))
+
+
+def joined(values: list[Values]) -> Values:
+    """The states of parts, one after the other, with the statics of the first."""
+    return replace(
+        values[0],
+        pose=tuple(np.concatenate(T) for T in zip(*(v.pose for v in values), strict=True)),
+        rate=tuple(np.concatenate(w) for w in zip(*(v.rate for v in values), strict=True)),
+    )

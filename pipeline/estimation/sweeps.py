@@ -10,10 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 import scipy.linalg
 
+from pipeline import threads
 from pipeline.estimation import blocks
 from pipeline.estimation.arrow import Chain
 
@@ -67,6 +69,8 @@ class Reduced:
     posterior sigmas, the statics held."""
     pull: float
     """The same of the statics, ``dz' S dz``. With the innovations it makes ``-g' dx``."""
+    columns: tuple[np.ndarray, ...]
+    """(q,) per chain: which of the statics the messages' columns belong to."""
     messages: tuple[tuple[Message, ...], ...]
     """Per part and chain."""
     log_det: float
@@ -100,18 +104,19 @@ def reduce(pieces: Pieces, count: int) -> Reduced:
         Something is held by nothing at all; the message names the epoch, counted within its part.
     """
     forward = _Forward()
-    for i in range(count):
-        forward.add(pieces(i))
+    with threads.crew() as crew:
+        for i, piece in enumerate(crew.each(pieces, range(count))):
+            forward.add(piece, crew, i == count - 1)
     return forward.reduced()
 
 
 def reduce_twice(pieces: Pieces, count: int) -> tuple[Reduced, Reduced]:
     """Sweep one with the motion prior as it is, and eased; each part is asked for once."""
     plain, eased = _Forward(), _Forward()
-    for i in range(count):
-        piece = pieces(i)
-        plain.add(piece)
-        eased.add(replace(piece, chains=piece.eased))
+    with threads.crew() as crew:
+        for i, piece in enumerate(crew.each(pieces, range(count))):
+            plain.add(piece, crew, i == count - 1)
+            eased.add(replace(piece, chains=piece.eased), crew, i == count - 1)
     return plain.reduced(), eased.reduced()
 
 
@@ -120,33 +125,29 @@ class _Forward:
 
     def __init__(self):
         self.messages: list[tuple[Message, ...]] = []
+        self.columns: tuple[np.ndarray, ...] = ()
         self.S = self.b = np.zeros(0)
         self.innovations: list[float] = []
         self.log_det = 0.0
 
-    def add(self, piece: Piece) -> None:
+    def add(self, piece: Piece, crew: threads.Crew, last: bool) -> None:
         """The part that follows."""
         if not self.messages:
             self.S, self.b = np.zeros_like(piece.C), np.zeros_like(piece.g_z)
+            self.columns = tuple(chain.columns for chain in piece.chains)
             self.messages.append(tuple(_nothing(chain) for chain in piece.chains))
         self.S += piece.C
         self.b -= piece.g_z
         self.innovations.append(0.0)
         following = []
-        for chain, message in zip(piece.chains, self.messages[-1], strict=True):
-            W = np.concatenate([chain.B, -chain.g[..., None]], axis=-1)
-            W[0] += message.W
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, W, piece.count)
-            flat = W[: piece.count].reshape(-1, W.shape[-1])
-            square = blocks.gram(flat, flat)
-            self.S[np.ix_(chain.columns, chain.columns)] -= square[:-1, :-1]
-            self.b[chain.columns] -= square[:-1, -1]
+        of_chains = crew.each(partial(_eliminated, piece), zip(piece.chains, self.messages[-1], strict=True))
+        for at, (square, log_det, message) in zip(self.columns, of_chains, strict=True):
+            self.S[np.ix_(at, at)] -= square[:-1, :-1]
+            self.b[at] -= square[:-1, -1]
             self.innovations[-1] += float(square[-1, -1])
-            self.log_det += 2 * float(np.sum(np.log(np.einsum("nii->ni", U[: piece.count]))))
-            if len(U) > piece.count:
-                following.append(Message(U[piece.count].copy(), W[piece.count].copy()))
-        self.messages.append(tuple(following))
+            self.log_det += log_det
+            following.append(message)
+        self.messages.append(() if last else tuple(following))
 
     def reduced(self) -> Reduced:
         """Solved for the statics."""
@@ -155,7 +156,20 @@ class _Forward:
             root = scipy.linalg.cho_factor(S)
             dz = scipy.linalg.cho_solve(root, self.b)
             log_det += 2 * float(np.sum(np.log(np.diagonal(root[0]))))
-        return Reduced(S, dz, tuple(self.innovations), float(self.b @ dz), tuple(self.messages), log_det)
+        innovations, messages = tuple(self.innovations), tuple(self.messages)
+        return Reduced(S, dz, innovations, float(self.b @ dz), self.columns, messages, log_det)
+
+
+def _eliminated(piece: Piece, given: tuple[Chain, Message]) -> tuple[np.ndarray, float, Message]:
+    """``[W, y]' [W, y]`` of a part of a chain, its share of the determinant's logarithm, and the message at its end."""
+    chain, message = given
+    D, W = message.D.copy(), message.W.copy()
+    square = np.zeros((W.shape[1], W.shape[1]))
+    damping = np.zeros(len(chain.D)) if piece.damping is None else piece.damping
+    bad, log_det = blocks.eliminate(chain.D, chain.A, chain.B, chain.g, damping, D, W, piece.count, square)
+    if bad >= 0:
+        raise np.linalg.LinAlgError(f"block {bad} is not positive definite")
+    return np.triu(square) + np.triu(square, 1).T, log_det, Message(D, W)
 
 
 def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarray]]]:
@@ -167,22 +181,27 @@ def steps(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[np.ndarr
     dx : list of (E, b) arrays
         Per chain, of the part's epochs and of the one it shares with the next.
     """
-    following: list[np.ndarray] = []
-    for i in reversed(range(len(reduced.messages) - 1)):
-        piece = pieces(i)
-        out = []
-        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
-            dz = reduced.dz[chain.columns]
-            x = -(chain.g + chain.B @ dz)[..., None]
-            x[0, :, 0] += message.W[:, -1] - message.W[:, :-1] @ dz
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, x, piece.count)
-            if len(x) > piece.count:
-                x[-1, :, 0] = following[c]
-            blocks.backward(U, F, x, piece.count)
-            out.append(x[..., 0])
-        following = [x[0].copy() for x in out]
-        yield i, out
+    following: tuple[np.ndarray | None, ...] = (None,) * len(reduced.columns)
+    back = range(len(reduced.messages) - 2, -1, -1)
+    with threads.crew() as crew:
+        for i, piece in zip(back, crew.each(pieces, back), strict=True):
+            given = zip(piece.chains, reduced.columns, reduced.messages[i], following, strict=True)
+            out = list(crew.each(partial(_moved, piece, reduced.dz), given))
+            following = tuple(x[0] for x in out)
+            yield i, out
+
+
+def _moved(piece: Piece, dz, given) -> np.ndarray:
+    """(E, b) steps of a part of a chain."""
+    chain, columns, message, following = given
+    x = -(chain.g + chain.B @ dz[chain.columns])[..., None]
+    x[0, :, 0] += message.W[:, -1] - message.W[:, :-1] @ dz[columns]
+    U, F = _factored(chain, piece, message)
+    blocks.forward(U, F, x, piece.count)
+    if following is not None:
+        x[-1, :, 0] = following
+    blocks.backward(U, F, x, piece.count)
+    return x[..., 0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,23 +218,29 @@ class Inverse:
 
 def inverses(pieces: Pieces, reduced: Reduced) -> Iterator[tuple[int, list[Inverse]]]:
     """Sweep two of the covariances: selected inverse and border, from the last part to the first."""
-    following: list[Inverse] = []
-    for i in reversed(range(len(reduced.messages) - 1)):
-        piece = pieces(i)
-        out = []
-        for c, (chain, message) in enumerate(zip(piece.chains, reduced.messages[i], strict=True)):
-            Y = chain.B.copy()
-            Y[0] += message.W[:, :-1]
-            U, F = _factored(chain, piece, message)
-            blocks.forward(U, F, Y, piece.count)
-            Z, G = np.empty_like(U), np.empty_like(F)
-            if len(U) > piece.count:
-                Y[-1], Z[-1] = following[c].Y[0], following[c].Z[0]
-            blocks.backward(U, F, Y, piece.count)
-            blocks.selected_inverse(U, F, Z, G, piece.count)
-            out.append(Inverse(Z, G, Y))
-        following = out
-        yield i, out
+    following: tuple[Inverse | None, ...] = (None,) * len(reduced.columns)
+    back = range(len(reduced.messages) - 2, -1, -1)
+    with threads.crew() as crew:
+        for i, piece in zip(back, crew.each(pieces, back), strict=True):
+            given = zip(piece.chains, reduced.messages[i], following, strict=True)
+            out = list(crew.each(partial(_inverse, piece), given))
+            following = tuple(out)
+            yield i, out
+
+
+def _inverse(piece: Piece, given) -> Inverse:
+    """Blocks of the inverse, a part of a chain."""
+    chain, message, following = given
+    Y = chain.B.copy()
+    Y[0] += message.W[:, :-1]
+    U, F = _factored(chain, piece, message)
+    blocks.forward(U, F, Y, piece.count)
+    Z, G = np.empty_like(U), np.empty_like(F)
+    if following is not None:
+        Y[-1], Z[-1] = following.Y[0], following.Z[0]
+    blocks.backward(U, F, Y, piece.count)
+    blocks.selected_inverse(U, F, Z, G, piece.count)
+    return Inverse(Z, G, Y)
 
 
 def _nothing(chain: Chain) -> Message:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
 
+from pipeline.estimation import motion_kernels
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
 from pipeline.network.datum import Tie
 from pipeline.network.model import Network
 from pipeline.network.start import Start
+
+MOST_KNOWN = 4096
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,9 +32,23 @@ class Statics:
     """Per variable: the time offset of the sensor in whose time its states stand."""
     size: int
     """p, how many unknowns there are in all."""
+    _known: dict[tuple, np.ndarray] = field(default_factory=dict, init=False, repr=False)
+    """What was asked for at the last few z: every part of a log asks for the same."""
 
     def value(self, index: int, z):
-        """The static's value."""
+        """The static's value, not to be written to."""
+        return self._once(("value", index), z, self._value)
+
+    def _once(self, name: tuple[str, int], z, function):
+        key = (*name, z.tobytes())
+        found = self._known.get(key)
+        if found is None:
+            if len(self._known) > MOST_KNOWN:
+                self._known.clear()
+            found = self._known[key] = function(name[1], z)
+        return found
+
+    def _value(self, index: int, z):
         correction = self.scale[index] @ z[self.columns[index]]
         if not self.is_pose[index]:
             return self.base[index] + correction
@@ -45,11 +62,53 @@ class Statics:
         return 0.0 if clock is None else float((self.scale[clock] @ z[self.columns[clock]])[0])
 
     def sensitivity(self, index: int, z):
-        """(n, r): change of the value, or right perturbation of the pose, by its unknowns."""
+        """(n, r): change of the value, or right perturbation of the pose, by its unknowns; not to be written to."""
+        return self._once(("sensitivity", index), z, self._sensitivity)
+
+    def _sensitivity(self, index: int, z):
         scale = self.scale[index]
         if not self.is_pose[index] or scale.shape[1] == 0:
             return scale
         return se3.Jr(scale @ z[self.columns[index]]) @ scale
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Along(Statics):
+    """Statics whose one unknown is how far they go along a step: for whoever knows the step, a border of one column."""
+
+    of: Statics
+    z: np.ndarray
+    """(p,) where they are."""
+
+    def value(self, index: int, z):
+        return self.of.value(index, self.z)
+
+    def clock_error(self, variable: int, z) -> float:
+        return self.of.clock_error(variable, self.z)
+
+    def _sensitivity(self, index: int, z):
+        scale = self.scale[index]
+        if not self.is_pose[index] or scale.shape[1] == 0:
+            return scale
+        return se3.Jr(self.of.scale[index] @ self.z[self.of.columns[index]]) @ scale
+
+
+def along(statics: Statics, z, dz) -> Along:
+    """Statics at z, that move along dz; both (p,)."""
+    moves = [len(columns) > 0 for columns in statics.columns]
+    return Along(
+        statics.base,
+        statics.is_pose,
+        tuple(
+            (scale @ dz[columns])[:, None] if m else scale
+            for scale, columns, m in zip(statics.scale, statics.columns, moves, strict=True)
+        ),
+        tuple(np.zeros(int(m), dtype=np.int64) for m in moves),
+        statics.clocks,
+        1,
+        of=statics,
+        z=z,
+    )
 
 
 def statics_of(network: Network, tied: Tie, start: Start) -> Statics:
@@ -83,7 +142,8 @@ class Values:
         pose, rate = [], []
         for T, w, d in zip(self.pose, self.rate, deltas, strict=True):
             if T.ndim == 3:
-                pose.append(se3.retract(T, d[:, :6]))
+                pose.append(np.empty_like(T))
+                motion_kernels.retract(T, d, pose[-1])
                 rate.append(w + d[:, 6:])
             else:
                 pose.append(T + d[:, 0])

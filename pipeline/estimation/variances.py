@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation import densities as motion_densities
 from pipeline.estimation import repeated as repeats
+from pipeline.estimation.checkpoint import FORGETFUL, Checkpoint
 from pipeline.estimation.densities import Densities
 from pipeline.estimation.likelihood import log_likelihood
 from pipeline.estimation.marginals import marginals_by_part
@@ -43,7 +44,13 @@ class Settled:
     """Before each round; see ``likelihood``."""
 
 
-def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, repeated: Repeated) -> Settled:
+def settle(
+    problem: Problem,
+    optimum: Optimum,
+    settings: EstimationSettings,
+    repeated: Repeated,
+    checkpoint: Checkpoint = FORGETFUL,
+) -> Settled:
     """Learn the variances, starting from an optimum with the configured ones.
 
     If the adjustment does not converge with what was learned, that optimum comes back as it was.
@@ -73,8 +80,8 @@ def settle(problem: Problem, optimum: Optimum, settings: EstimationSettings, rep
             near = True
         if (moved < SETTLED and near) or rounds == ROUNDS:
             break
-        at = optimise(trial, settings.huber, ROUND_STEPS, near=True)
-    at = optimise(trial, settings.huber, settings.max_iterations, near=True)
+        at = optimise(trial, settings.huber, ROUND_STEPS, True, checkpoint, f"round {rounds}")
+    at = optimise(trial, settings.huber, settings.max_iterations, True, checkpoint, "settled")
     if not at.converged:
         return Settled(problem, optimum, repeated, tuple(start), 0, ())
     return Settled(trial, at, shares, tuple(densities), rounds, tuple(likely))

@@ -38,9 +38,13 @@ def from_points(xy_source, xy_target, weight=None):
     A[..., 0, 0:2], A[..., 0, 2] = p, 1.0
     A[..., 1, 3:5], A[..., 1, 5] = p, 1.0
     A[..., 6:8] = -q[..., :, None] * p[..., None, :]
-    N = np.einsum("...m,...mki,...mkj->...ij", weight, A, A)
-    b = np.einsum("...m,...mki,...mk->...i", weight, A, q)
-    fixed = (np.linalg.cond(N) < MOST_CONDITION)[..., None]
+    rows = A.reshape(A.shape[:-3] + (-1, 8))
+    weighed = np.swapaxes((A * weight[..., None, None]).reshape(rows.shape), -1, -2)
+    N = weighed @ rows
+    b = (weighed @ q.reshape(rows.shape[:-1] + (1,)))[..., 0]
+    finite = np.isfinite(N).all(axis=(-1, -2))
+    spread = np.abs(np.linalg.eigvalsh(np.where(finite[..., None, None], N, 0.0)))
+    fixed = (spread.max(axis=-1) < MOST_CONDITION * spread.min(axis=-1))[..., None]
     h = np.linalg.solve(np.where(fixed[..., None], N, np.eye(8)), np.where(fixed, b, np.nan)[..., None])[
         ..., 0
     ]

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
+from pipeline import threads
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
-from pipeline.network.views import off_px
+from pipeline.network.views import CHUNK, off_px
 
 OWN_SIGMA_PX = 0.3
 """A picture against its own pose: corner noise, and what uncertain intrinsics do."""
@@ -33,13 +35,20 @@ def score(candidates, views, around):
     total = np.zeros(candidates.shape[:2])
     worst = np.zeros(candidates.shape[:2])
     for view, (rows, before, after, step) in zip(views, around, strict=True):
-        E = candidates[rows]
-        if step.edge.ratio != 1.0:
-            E = fr.turn(step.edge.ratio * np.arctan2(E[..., 1, 0], E[..., 0, 0]))
-        T = before[:, None] @ (se3.inverse(E) if step.sign < 0 else E) @ after[:, None]
-        off = off_px(T, view.p_marker, view.xy, view.focal_px)
-        total[rows] += np.sum(np.where(view.seen[:, None], off, 0.0) ** 2, axis=-1)
-        middle = np.sum(np.where(view.seen[:, None], off, 0.0), axis=-1) / view.seen.sum(-1)[:, None]
+
+        def chunk(a: int, view=view, rows=rows, before=before, after=after, step=step):
+            some = slice(a, a + CHUNK)
+            E = candidates[rows[some]]
+            if step.edge.ratio != 1.0:
+                E = fr.turn(step.edge.ratio * np.arctan2(E[..., 1, 0], E[..., 0, 0]))
+            T = before[some, None] @ (se3.inverse(E) if step.sign < 0 else E) @ after[some, None]
+            off = off_px(T, view.p_marker, view.xy[some], view.focal_px)
+            off = np.where(view.seen[some, None], off, 0.0)
+            return np.sum(off**2, axis=-1), np.sum(off, axis=-1) / view.seen[some].sum(-1)[:, None]
+
+        chunks = threads.each(chunk, range(0, len(rows), CHUNK))
+        square, middle = (np.concatenate(c) for c in zip(*chunks, strict=True))
+        total[rows] += square
         worst[rows] = np.maximum(worst[rows], middle)
     bad = np.isnan(candidates[..., 0, 0])
     return np.where(bad, np.inf, 0.5 * total / OTHER_SIGMA_PX**2), np.where(bad, np.inf, worst)
@@ -72,23 +81,36 @@ def viterbi(candidates, cost, time_s):
         unary = np.where(np.isfinite(cost), np.minimum(cost - best, PICTURE_CAP), 1e6)
     # What is no candidate is priced out above; as the identity it cannot overflow here.
     rows = np.where(np.isfinite(candidates), candidates, np.eye(4))
-    n, k = candidates.shape[:2]
-    value, back = unary[0], np.zeros((n, k), dtype=np.int64)
-    if n > 1:
-        R, t = rows[..., :3, :3], rows[..., :3, 3]
-        cosine = 0.5 * (np.einsum("naij,nbij->nab", R[:-1], R[1:]) - 1)
-        angle = np.arccos(np.clip(cosine, -1, 1))
-        shift = np.linalg.norm(t[1:, None] - t[:-1, :, None], axis=-1)
-        dt = np.diff(time_s)[:, None, None]
-        step = 0.5 * (angle / (TURN_RAD + TURN_RAD_S * dt)) ** 2
-        step += 0.5 * (shift / (SHIFT_M + SHIFT_M_S * dt)) ** 2
-        step = np.minimum(step, STEP_CAP)
-        for i in range(1, n):
-            total = value[:, None] + step[i - 1]
-            back[i] = total.argmin(axis=0)
-            value = total[back[i], np.arange(k)] + unary[i]
+    return _cheapest(rows, unary, np.diff(time_s))
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _cheapest(poses, unary, dt_s):
+    """The cheapest way through poses (n, k, 4, 4) with prices of their own (n, k), (n,)."""
+    n, k = unary.shape
+    value, new = unary[0].copy(), np.empty(k)
+    back = np.zeros((n, k), dtype=np.int64)
+    for i in range(1, n):
+        turn, way = TURN_RAD + TURN_RAD_S * dt_s[i - 1], SHIFT_M + SHIFT_M_S * dt_s[i - 1]
+        for b in range(k):
+            T_b = poses[i, b]
+            new[b] = np.inf
+            for a in range(k):
+                T_a = poses[i - 1, a]
+                trace = square = 0.0
+                for u in range(3):
+                    for v in range(3):
+                        trace += T_a[u, v] * T_b[u, v]
+                    square += (T_b[u, 3] - T_a[u, 3]) ** 2
+                angle = np.arccos(min(max(0.5 * (trace - 1), -1.0), 1.0))
+                step = 0.5 * (angle / turn) ** 2 + 0.5 * square / way**2
+                total = value[a] + min(step, STEP_CAP)
+                if total < new[b]:
+                    new[b], back[i, b] = total, a
+        for b in range(k):
+            value[b] = new[b] + unary[i, b]
     chosen = np.empty(n, dtype=np.int64)
-    chosen[-1] = value.argmin()
+    chosen[n - 1] = value.argmin()
     for i in range(n - 1, 0, -1):
         chosen[i - 1] = back[i, chosen[i]]
     return chosen

@@ -62,7 +62,8 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
         are dropped.
     """
     dropped: dict[str, int] = {}
-    stamps, frame_index = _clusters(observations.time_ns, FRAMES_MERGE_NS)
+    frames, frame_index = _clusters(observations.time_ns, FRAMES_MERGE_NS)
+    stamps = frames
     taken = {}
     for s, sensor in enumerate(network.sensors):
         if sensor.name not in readings:
@@ -75,7 +76,7 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
     if lonely:
         own, _ = _clusters(np.concatenate(lonely), READINGS_MERGE_NS)
         stamps = np.union1d(stamps, own)
-    frame_epoch = np.searchsorted(stamps, _clusters(observations.time_ns, FRAMES_MERGE_NS)[0])[frame_index]
+    frame_epoch = np.searchsorted(stamps, frames)[frame_index]
     sensors = {}
     for s, (time_ns, raw) in taken.items():
         epoch = _nearest(time_ns, stamps)

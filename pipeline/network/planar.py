@@ -81,12 +81,13 @@ def _nearest_rotation(R):
 
 def _translation(R, q3, xy, weight):
     """Least-squares origin of the centred points, in the camera, for a given rotation: (n, 3)."""
-    y = np.einsum("nij,nmj->nmi", R, q3)
+    y = q3 @ np.swapaxes(R, -1, -2)
     M = np.zeros(xy.shape + (3,))
     M[..., 0, 0] = M[..., 1, 1] = 1.0
     M[..., 2] = -xy
     r = xy * y[..., 2:] - y[..., :2]
-    N = np.einsum("nm,nmki,nmkj->nij", weight, M, M)
-    b = np.einsum("nm,nmki,nmk->ni", weight, M, r)
+    weighed = np.swapaxes((M * weight[..., None, None]).reshape(len(M), -1, 3), -1, -2)
+    N = weighed @ M.reshape(len(M), -1, 3)
+    b = (weighed @ r.reshape(len(M), -1, 1))[..., 0]
     N = np.where(np.isfinite(N).all(axis=(-1, -2), keepdims=True), N, np.eye(3))
     return np.linalg.solve(N, b[..., None])[..., 0]

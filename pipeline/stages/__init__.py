@@ -144,7 +144,7 @@ STAGES = (
     Stage("detect", 4, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        13,
+        14,
         "adjusting the network",
         ("ingest", "detect"),
         (),

@@ -5,6 +5,10 @@ from __future__ import annotations
 import datetime
 import logging
 import time
+import zipfile
+from pathlib import Path
+
+import numpy as np
 
 from pipeline.estimation import adjust
 from pipeline.estimation.repeated import Repeated
@@ -17,7 +21,11 @@ from pipeline.estimation.table import (
 )
 from pipeline.logs.clock import EARLIEST_NS
 from pipeline.network import network_of
+from pipeline.runs import atomic_file
 from pipeline.stages.job import Counts, Job, Progress
+
+WORTH_S = 1.0
+"""An iteration that took less than this is not kept."""
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +41,8 @@ def run(job: Job, progress: Progress) -> Counts:
     readings = readings_of(job.read_table("sensors"))
     logger.info("adjusting %d tags and %d sensors", len(observations.camera), len(readings))
     progress.total(1)
-    solution = adjust(network, observations, readings, job.site.estimation, Repeated(), learn=True)
+    checkpoint = Scratch(job.scratch, job.fingerprint)
+    solution = adjust(network, observations, readings, job.site.estimation, Repeated(), True, checkpoint)
     with job.table_writer("states") as writer:
         for states in solution.states:
             writer.write(columns_of_states(states))
@@ -63,6 +72,37 @@ def run(job: Job, progress: Progress) -> Counts:
         "iterations": figures["iterations"],
         "sigma0": figures["sigma0"],
     }
+
+
+class Scratch:
+    """A ``Checkpoint`` in files of the stage's scratch folder, each written whole or not at all."""
+
+    def __init__(self, folder: Path, fingerprint: str, worth_s: float = WORTH_S):
+        self._folder, self._fingerprint, self._worth_s = folder, fingerprint, worth_s
+        self._last = time.monotonic()
+
+    def _file(self, name: str) -> Path:
+        return self._folder / f"{name.replace(' ', '-')}.npz"
+
+    def recall(self, name: str) -> dict[str, np.ndarray] | None:
+        """What a run that was killed kept; None where the file is of other inputs, or not to be read."""
+        try:
+            with np.load(self._file(name), allow_pickle=False) as file:
+                found = dict(file)
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile):
+            return None
+        return found if found.pop("fingerprint", np.array("")).item() == self._fingerprint else None
+
+    def keep(self, name: str, arrays: dict[str, np.ndarray]) -> None:
+        """Declines what took less than a second or so: to write it would take longer than to do it again."""
+        if time.monotonic() - self._last < self._worth_s:
+            return
+        with atomic_file(self._file(name)) as stream:
+            np.savez(stream, fingerprint=np.array(self._fingerprint), allow_pickle=False, **arrays)
+        self._last = time.monotonic()
+
+    def forget(self, name: str) -> None:
+        self._file(name).unlink(missing_ok=True)
 
 
 def _day_of(start_ns: int) -> datetime.date | None:

@@ -106,6 +106,24 @@ def test_a_log_that_was_approached_ends_where_it_does_from_its_start(problem, pl
     print(f"{near.iterations} steps of everything, {plain.iterations} from the start")
 
 
+def test_states_that_follow_span_by_span_are_those_that_follow_as_one(problem, plain, monkeypatch):
+    """A span ends in the gap; where it ends is not to be seen, for 100 epochs on either side are adjusted with it."""
+    weights = keep_all(problem, HUBER)
+    start = replace(problem.first, z=plain.values.z)
+    monkeypatch.setattr(iterations, "NEAR_STEPS", 8)
+    whole = iterations._followed(problem, start, weights, 2)
+    monkeypatch.setattr(iterations, "SPAN", 90)
+    monkeypatch.setattr(iterations, "MARGIN", 100)
+    spans = iterations._followed(problem, start, weights, 2)
+    assert spans.z.tobytes() == plain.values.z.tobytes()
+    found, E = marginals(problem, whole, weights), len(problem.epochs.time_ns)
+    for k in range(len(problem.tie.variables)):
+        c, at = problem.place(k)
+        sigma = np.sqrt(np.einsum("nii->ni", found.Z[c][:, at, at]))
+        rate = (spans.rate[k] - whole.rate[k]).reshape(E, -1) / sigma[:, sigma.shape[1] // 2 :]
+        assert np.abs(rate).max() < 0.05
+
+
 def test_no_unknown_moves_further_than_the_bound_says(problem, plain):
     """In posterior sigmas, with all unknowns off the optimum, and with the statics alone; in parts of 64 epochs."""
     rng = np.random.default_rng(2)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from pipeline.estimation import arrow, sweeps
+from pipeline import threads
+from pipeline.estimation import arrow, motion_kernels, parts, sweeps
 from pipeline.estimation.marginals import marginals
-from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise
+from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise, linearised_along
 from pipeline.estimation.optimise import optimise, pieces
 from pipeline.estimation.parts import bounds, part_of
 from pipeline.estimation.problem import (
@@ -18,6 +19,7 @@ from pipeline.estimation.problem import (
     motion_residual,
 )
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
+from pipeline.geometry import se3
 from tests.estimation import dense
 from tests.estimation.simulator import Options, draw
 from tests.estimation.test_adjust import _problem
@@ -181,3 +183,43 @@ def test_a_log_adjusted_in_parts_ends_where_the_log_in_one_piece_does(monkeypatc
     assert first.values.z.tobytes() == second.values.z.tobytes()
     for a, b in zip(first.values.pose, second.values.pose, strict=True):
         assert a.tobytes() == b.tobytes()
+
+
+@pytest.mark.parametrize("newton", [False, True])
+def test_a_border_along_a_step_is_the_whole_border_times_the_step(at, newton):
+    problem, values, weights = at
+    dz = 0.2 * np.random.default_rng(8).standard_normal(problem.statics.size)
+    whole, _, _ = linearise(problem, values, weights, newton)
+    for chain, ours in zip(whole, linearised_along(problem, values, weights, dz, newton), strict=True):
+        right = chain.g + chain.B @ dz[chain.columns]
+        np.testing.assert_allclose(ours.g, right, atol=1e-11 * np.abs(right).max())
+        np.testing.assert_array_equal(ours.D, chain.D)
+        np.testing.assert_array_equal(ours.A, chain.A)
+
+
+def test_states_are_moved_as_the_exponential_says():
+    rng = np.random.default_rng(2)
+    angle = np.r_[0.0, 1e-12, 1e-6, 0.03, 0.0316, 0.0317, 0.1, 1.0, 3.0, np.pi, 4.0]
+    axis = rng.standard_normal((len(angle), 3))
+    axis *= (angle / np.linalg.norm(axis, axis=-1))[:, None]
+    d = np.concatenate([rng.standard_normal((len(angle), 3)), axis, np.ones((len(angle), 6))], axis=-1)
+    T = se3.exp(rng.standard_normal((len(angle), 6)))
+    moved = np.empty_like(T)
+    motion_kernels.retract(T, d, moved)
+    np.testing.assert_allclose(moved, se3.retract(T, d[:, :6]), rtol=0, atol=3e-15)
+
+
+@pytest.mark.parametrize("parts_of", [6, 9])
+def test_the_optimum_has_the_same_bytes_on_one_core_and_on_two(at, parts_of, monkeypatch):
+    problem, _, _ = at
+    monkeypatch.setattr(parts.bounds, "__defaults__", (parts_of,))
+    monkeypatch.setattr("pipeline.estimation.optimise.KEPT_PARTS", 1)
+    found = []
+    for cores in (1, 2, 3):
+        monkeypatch.setattr(threads, "cores", lambda cores=cores: cores)
+        optimum = optimise(problem, HUBER, 60)
+        m = marginals(problem, optimum.values, optimum.weights)
+        found.append([*optimum.values.pose, *optimum.values.rate, optimum.values.z, *m.Z, *m.Y, m.P_zz])
+    for other in found[1:]:
+        for a, b in zip(found[0], other, strict=True):
+            assert a.tobytes() == b.tobytes()

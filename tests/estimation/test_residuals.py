@@ -14,6 +14,7 @@ from pipeline.network import Readings
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
 from tests.estimation.simulator import MACHINE, Options, draw
+from tests.estimation.test_adjust import _problem
 
 
 def _document():
@@ -193,3 +194,14 @@ def test_a_tag_with_a_constant_of_its_own_may_be_absent_from_a_part_of_the_log()
     r, J = corner_residuals(none, problem.first, problem.statics)
     assert group.offset is not None and r.shape == (0, 8)
     assert J.statics[group.offset].shape == (0, 8, 8)
+
+
+def test_statics_of_another_scale_remember_nothing_of_the_old_one():
+    statics = _problem(draw(3, Options(3))).statics
+    z = np.random.default_rng(1).standard_normal(statics.size)
+    before = [statics.value(k, z).copy() for k in range(len(statics.base))]
+    wider = replace(statics, scale=tuple(2.0 * scale for scale in statics.scale))
+    for k, columns in enumerate(statics.columns):
+        assert np.array_equal(statics.value(k, z), before[k])
+        assert np.array_equal(wider.value(k, 0.5 * z), before[k])
+        assert not len(columns) or not np.array_equal(wider.value(k, z), before[k])
