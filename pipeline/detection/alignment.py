@@ -12,7 +12,6 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.gauss_newton import COARSE_STEP_PX, step
 from pipeline.detection.image_model import (
     AT_END,
     BLUR,
@@ -25,33 +24,20 @@ from pipeline.detection.image_model import (
 )
 from pipeline.detection.integrity import (
     contradicted,
-    level,
-    mask,
     neighbours,
     noise_on_edges,
     pattern,
     point,
     unevenness,
 )
-from pipeline.detection.parts import best_part
+from pipeline.detection.settling import approach, by_parts, settle
 from pipeline.detection.straightening import bent_back, ideal_of
 
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
 
 MAX_CELLS = 16
-MORE_PARTLY = 2.0
-"""Of which at most so many times the contrast's share counts."""
 COARSE_PIXELS = 200
 """Pixels on edges for the first steps."""
-QUIET = 0.02
-"""Noise over contrast for which a limit of pixels is meant; noisier tags get more of them, by its square."""
-FINE_STEP_PX, FINEST_STEP_PX = 0.3, 0.05
-"""A step this short is the last one: edges are as steep on either side, so what it leaves undone is of the third order.
-The second where every pixel is used, and the noise leaves less than that. With 0.1 for the first there were a tenth
-more steps on a part of the pixels, and corners were no nearer to the truth in the third digit."""
-CALM = 0.04
-"""Residuals over contrast after one coarse step, up to which it may be the only one; where something lies over the
-print they are larger, and cells stand out from the second step on."""
 MISFIT_MOST = 0.2
 """What neighbouring residuals share, as a part of the print's pattern, at the most. Right prints gave up to 0.22
 (1.5 px of blur, 20 px, 45 degrees), mostly below 0.15; wrong ids from 0.19, mostly above 0.35."""
@@ -77,9 +63,6 @@ CLIPPED, CLIPPED_VARIANCE = 0.05, 4.5
 them, and JPEG's ringing beside it, add to the variance of corners."""
 SUSPICIOUS = 0.12
 """Misfit from which parts of the print are tried alone."""
-STRAYED_PX = 1.2
-"""How far a print may go from where a part of it lay. A cover along one side took it 2 px away, to a place that seemed
-good and was 7 sigmas off; at 0.6 a third of what is covered and stands would be lost."""
 HOPELESS = 0.4
 """Misfit beyond which no part fits either: nothing is there, or next to nothing of it."""
 UNLIKE_NOTHING = 0.4
@@ -193,17 +176,17 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
     strides = (coarse, fine, flat)
     levels, uneven, parted, strayed = cells, False, False, False
     A = np.zeros((PARAMETERS, PARAMETERS))
-    H, m, share = _approach(grey, cells, n, masked, H, par, prior, place, strides, room_for)
+    H, m, share = approach(grey, cells, n, masked, H, par, prior, place, strides, room_for)
     misfit = _misfit(J, r, who, m, par)
     if m > 0 and misfit < HOPELESS:
         # What lies over the print shows by now: all pixels beside it would cost more than those of the parts.
         if misfit > SUSPICIOUS or share < 1.0 - PARTLY:
             parted = True
-            H, m, A, share, strayed = _by_parts(
+            H, m, A, share, strayed = by_parts(
                 grey, cells, n, masked, H, par, prior, place, strides, room_for, room_for_parts
             )
         else:
-            H, m, A, share = _settle(grey, cells, n, masked, H, par, prior, place, strides, room_for, False)
+            H, m, A, share = settle(grey, cells, n, masked, H, par, prior, place, strides, room_for, False)
     while m > 0:
         unlike = unevenness(r, who, m, n, par, masked)
         misfit = _misfit(J, r, who, m, par)
@@ -212,7 +195,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
         if not parted and misfit < HOPELESS:
             # Something lies over the print, and the whole of it gave way: does a part of it fit by itself?
             parted = True
-            H, m, A, share, strayed = _by_parts(
+            H, m, A, share, strayed = by_parts(
                 grey, cells, n, masked, H, par, prior, place, strides, room_for, room_for_parts
             )
             continue
@@ -221,7 +204,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
         # A shadow's edge across the print is no noise: each cell gets a brightness of its own.
         uneven, levels = True, cells.copy()
         masked[:] = False
-        H, m, A, share = _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, True)
+        H, m, A, share = settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, True)
     if m == 0 or strayed:
         reason = CUT if m == 0 and at_border else COVERED
 
@@ -273,100 +256,6 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
             if not (0.0 <= out_uv[k, 0] <= width - 1 and 0.0 <= out_uv[k, 1] <= height - 1):
                 reason = CUT
     out[REASON] = reason
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _approach(grey, cells, n, masked, H, par, prior, place, strides, room_for):
-    """Steps on a part of the pixels until they are short; marks cells in `masked`, changes `par`.
-
-    Returns the homography, how many pixels were used (0 where too few were left; their residuals are those after the
-    last step) and the share of cells not masked.
-    """
-    coarse, _, flat = strides
-    _, r, who = room_for
-    share, steps = 1.0, 0
-    while True:
-        H, m, _, sigma, step_px = _stepped(
-            grey, cells, n, masked, H, par, prior, place, coarse, flat, False, room_for
-        )
-        if m == 0:
-            return H, 0, share
-        steps += 1
-        changed = False
-        if steps >= 2 and step_px < 0.5:
-            changed, share = mask(r, who, m, n, par, masked, 3.0)
-        short = step_px < COARSE_STEP_PX and not changed
-        if (short and (steps >= 2 or sigma < CALM * par[GAIN])) or steps >= 8:
-            return H, m, share
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, uneven):
-    """Steps on all pixels that are asked for until they are short; marks cells in `masked`, changes `par`.
-
-    With fewer pixels as long as they move: how many the noise asks for is known when they no longer do. Returns as
-    `_approach` does, the normal matrix with its priors after the pixels.
-    """
-    _, fine, flat = strides
-    _, r, who = room_for
-    share, steps, more = 1.0, 0, 1.0
-    while True:
-        stride = max(1, math.ceil(fine / more))
-        H, m, A, sigma, step_px = _stepped(
-            grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for
-        )
-        if m == 0:
-            return H, 0, A, share
-        steps += 1
-        changed, share = mask(r, who, m, n, par, masked, 2.0 if uneven else 3.0)
-        if uneven:
-            level(r, who, m, n, par, masked, levels)
-        short = step_px < (FINE_STEP_PX if stride > 1 else FINEST_STEP_PX)
-        still = (short and not changed and not uneven) or steps >= 6
-        if uneven or (still and more == 1.0):
-            most = 3.0 if share == 1.0 else MORE_PARTLY
-            more = min(max(sigma / (QUIET * max(par[GAIN], 1.0)), 1.0), most) ** 2
-        if steps >= 8 or (still and max(1, math.ceil(fine / more)) >= stride):
-            return H, m, A, share
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _by_parts(grey, cells, n, masked, H, par, prior, place, strides, room_for, room_for_parts):
-    """The print laid by the part of it that fits by itself, as `_settle` does; and whether it strayed from that part:
-    then it gave way to what lies over it.
-    """
-    lo, hi = place[5], place[6]
-    of_part = best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for_parts)
-    H, m, A, share = _settle(grey, cells, n, masked, of_part, par, prior, place, strides, room_for, False)
-    return H, m, A, share, m > 0 and _apart(of_part, H, lo, hi) > STRAYED_PX
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _apart(H, other, lo, hi):
-    """How far two homographies put the corner that they agree on least, px."""
-    most = 0.0
-    for k in range(4):
-        s, t = lo if k == 0 or k == 3 else hi, lo if k < 2 else hi
-        x, y = point(H, s, t)
-        u, v = point(other, s, t)
-        most = max(most, math.sqrt((u - x) ** 2 + (v - y) ** 2))
-    return most
-
-
-@numba.njit(cache=True, error_model="numpy")
-def _stepped(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for):
-    """`step`, with the residuals as they are after it; their standard deviation in place of the step.
-
-    How far it moved counts the width of the blur too: where that is still on its way, so is all else. Without it one of
-    150 tags was left 5.5 sigmas off, its blur half-way.
-    """
-    blur_px = math.sqrt(par[BLUR])
-    H, m, A, x, step_px = step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for)
-    J, r, who = room_for
-    for k in range(m):
-        for i in range(PARAMETERS):
-            r[k] -= J[k, i] * x[i]
-    return H, m, A, noise_on_edges(r, who, m)[0], max(step_px, abs(math.sqrt(par[BLUR]) - blur_px))
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -16,7 +16,7 @@ import scipy.linalg
 
 from pipeline.errors import EstimationError
 from pipeline.estimation import sweeps
-from pipeline.estimation.optimise import parts, pieces
+from pipeline.estimation.linearised import parts, pieces
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem, Weights
 from pipeline.estimation.pull import EASE

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from threading import Lock
 
 import numpy as np
 
 from pipeline import threads
 from pipeline.errors import EstimationError
 from pipeline.estimation import approach, gates, sweeps
-from pipeline.estimation.arrow import Chain
 from pipeline.estimation.checkpoint import (
     FORGETFUL,
     UNKEPT,
@@ -24,7 +21,8 @@ from pipeline.estimation.checkpoint import (
     values_of,
     weights_of,
 )
-from pipeline.estimation.normal import cost_by_epoch, linearise, linearise_twice, linearised_along
+from pipeline.estimation.linearised import KEPT_PARTS, cost_of, parts, pieces
+from pipeline.estimation.normal import linearised_along
 from pipeline.estimation.parts import PART_EPOCHS, Part, bounds, joined, part_of
 from pipeline.estimation.parts import cut as cut_of
 from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
@@ -57,7 +55,6 @@ SPREAD, SPREAD_OVER = 0.5, 100
 """Share of the stretches, and how many at least, from which a rise is the statics' doing: then the step is shortened,
 and nothing damped."""
 TRIES = 14
-KEPT_PARTS = 4
 HOLD = 1e12
 """Information that keeps an unchecked static where it is during the steps; a prior is 1. Not for covariances."""
 
@@ -223,44 +220,6 @@ def _followed(problem: Problem, values: Values, weights: Weights, irls: int) -> 
     return replace(joined(found), z=z)
 
 
-def parts(problem: Problem, values: Values, weights: Weights) -> list[Part]:
-    """All parts of a log, in order."""
-    return [part_of(problem, values, weights, a, b) for a, b in bounds(problem)]
-
-
-def pieces(
-    cut: list[Part],
-    newton=False,
-    finish: Callable[[int, sweeps.Piece], sweeps.Piece] | None = None,
-    ease: float | None = None,
-) -> sweeps.Pieces:
-    """Normal equations of the parts, when they are asked for; ``newton`` and ``ease`` are those of ``linearise_twice``.
-
-    The last few stay: sweep two begins where sweep one ends, and a short log is linearised once.
-    """
-    kept: dict[int, sweeps.Piece] = {}
-    bookkeeping = Lock()
-
-    def piece(i: int) -> sweeps.Piece:
-        found = kept.get(i)
-        if found is None:
-            part = cut[i]
-            at = part.problem, part.values, part.weights
-            eased: list[Chain] = []
-            if ease is None:
-                chains, C, g_z = linearise(*at, newton)
-            else:
-                chains, eased, C, g_z = linearise_twice(*at, ease, newton)
-            found = sweeps.Piece(tuple(chains), C, g_z, part.epochs, eased=tuple(eased))
-            with bookkeeping:  # several threads ask
-                while len(kept) >= KEPT_PARTS:
-                    kept.pop(next(iter(kept)))
-                kept[i] = found
-        return finish(i, found) if finish else found
-
-    return piece
-
-
 def _iterate(
     problem: Problem, values: Values, weights: Weights, limit: int, irls: int, log: Iterations = UNKEPT
 ):
@@ -424,14 +383,3 @@ class Step:
 
         moved = joined(threads.each(moved_part, self.cut))
         return replace(moved, z=self.values.z + shorten * self.dz)
-
-
-def cost_of(problem: Problem, values: Values, weights: Weights):
-    """``cost_by_epoch`` of the whole log, part by part."""
-    local, prior = np.zeros(len(problem.epochs.time_ns)), 0.0
-    cut = parts(problem, values, weights)
-    costs = threads.each(lambda part: cost_by_epoch(part.problem, part.values, part.weights), cut)
-    for part, (of_part, of_statics) in zip(cut, costs, strict=True):
-        local[part.start : part.stop] = of_part[: part.epochs]
-        prior += of_statics
-    return local, prior

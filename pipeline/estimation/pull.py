@@ -33,6 +33,7 @@ import numpy as np
 
 from pipeline.errors import EstimationError
 from pipeline.estimation import optimise
+from pipeline.estimation.linearised import cost_of
 from pipeline.estimation.problem import Problem, unchecked_statics
 
 EASE = 1e3
@@ -69,7 +70,7 @@ def unpulled(problem: Problem, optimum: optimise.Optimum) -> optimise.Optimum:
         # The next one would be as much shorter than this as this is than the last.
         left = step.longest * min(step.longest / before, 1.0)
         if left < optimise.STEP_SIGMAS:
-            local, prior = optimise.cost_of(problem, values, optimum.weights)
+            local, prior = cost_of(problem, values, optimum.weights)
             return replace(
                 optimum,
                 values=values,

@@ -10,7 +10,8 @@ import scipy.linalg
 
 from pipeline.errors import EstimationError
 from pipeline.estimation import changes, sweeps
-from pipeline.estimation.optimise import Optimum, optimise, parts, pieces
+from pipeline.estimation.linearised import parts, pieces
+from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.residuals import Corners, SensorReadings
 from pipeline.estimation.steps import mounts_and_sensors

@@ -7,9 +7,10 @@ import pytest
 
 from pipeline.estimation import approach, sweeps
 from pipeline.estimation import optimise as iterations
+from pipeline.estimation.linearised import pieces
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import linearise
-from pipeline.estimation.optimise import optimise, pieces
+from pipeline.estimation.optimise import optimise
 from pipeline.estimation.parts import bounds, part_of
 from pipeline.estimation.problem import keep_all
 from tests.estimation.simulator import Options, draw

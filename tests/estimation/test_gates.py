@@ -7,7 +7,8 @@ import pytest
 
 from pipeline.estimation import gates
 from pipeline.estimation.adjust import problem_of_log
-from pipeline.estimation.optimise import optimise, parts
+from pipeline.estimation.linearised import parts
+from pipeline.estimation.optimise import optimise
 from pipeline.geometry import se3
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of

@@ -5,9 +5,10 @@ import pytest
 
 from pipeline import threads
 from pipeline.estimation import arrow, motion_kernels, parts, sweeps
+from pipeline.estimation.linearised import pieces
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import corner_lengths, cost_by_epoch, linearise, linearised_along
-from pipeline.estimation.optimise import optimise, pieces
+from pipeline.estimation.optimise import optimise
 from pipeline.estimation.parts import bounds, part_of
 from pipeline.estimation.problem import (
     LOST,

@@ -11,9 +11,10 @@ from benchmarks.adjustment import corners_drawn, network_drawn
 from pipeline.estimation import approach, diagnostics, sweeps
 from pipeline.estimation import optimise as iterations
 from pipeline.estimation.adjust import adjust, problem_of_log
+from pipeline.estimation.linearised import parts, pieces
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import linearise, linearise_twice
-from pipeline.estimation.optimise import optimise, parts, pieces
+from pipeline.estimation.optimise import optimise
 from pipeline.estimation.problem import keep_all
 from pipeline.estimation.pull import EASE, unpulled
 from pipeline.estimation.values import Values
