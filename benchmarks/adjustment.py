@@ -8,8 +8,8 @@ covariances with their own and common part, and the cutting edge's. Tables and d
 them are not in it.
 
 Bars: 288,000 epochs in 3 minutes and 2 GB; time per epoch flat from 10,000 epochs up (within 25 %). Where the clock
-ran 1.3 times as long as the processor worked, the machine did other work too: then the processor's seconds, of one
-core, are held against the bar, and the closing line says so. The table is drawn in results/adjustment.png.
+ran 1.3 times as long as the processor worked, the machine did other work too: then the processor's seconds, of all
+cores together, are held against the bar, and the closing line says so. The table is drawn in results/adjustment.png.
 """
 
 from __future__ import annotations
@@ -188,9 +188,9 @@ def draw(rows: list[Row], path=PICTURE) -> None:
         each.fill_between(epochs, below, above, alpha=0.6, label=name)
         below = above
     whole.axhline(SECONDS_BAR, color="k", linestyle=":", linewidth=0.8)
-    whole.set(xlabel="epochs", ylabel="s of one core", title=f"time (bar {SECONDS_BAR:.0f} s)")
+    whole.set(xlabel="epochs", ylabel="s of all cores", title=f"time (bar {SECONDS_BAR:.0f} s)")
     whole.legend(fontsize=7)
-    each.set(xscale="log", ylim=(0, None), xlabel="epochs", ylabel="us of one core", title="time per epoch")
+    each.set(xscale="log", ylim=(0, None), xlabel="epochs", ylabel="us of all cores", title="time per epoch")
     each.legend(fontsize=7)
     memory.semilogx(epochs, [row.megabytes for row in rows], "o-", label="largest")
     memory.semilogx(epochs, [row.input_megabytes for row in rows], ".-", linewidth=0.8, label="input alone")
