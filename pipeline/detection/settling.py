@@ -18,8 +18,8 @@ QUIET = 0.02
 """Noise over contrast for which a limit of pixels is meant; noisier tags get more of them, by its square."""
 FINE_STEP_PX, FINEST_STEP_PX = 0.2, 0.005
 """A step this short is the last one: edges are as steep on either side, so what it leaves undone is of the third order.
-The second where every pixel is used: two starts then end a third of a sigma apart. With 0.1 for the first there were a tenth
-more steps on a part of the pixels, and corners were no nearer to the truth in the third digit."""
+The second where every pixel is used: two starts then end a third of a sigma apart. With 0.1 for the first there were a
+tenth more steps on a part of the pixels, and corners were no nearer to the truth in the third digit."""
 CALM = 0.04
 """Residuals over contrast after one coarse step, up to which it may be the only one; where something lies over the
 print they are larger, and cells stand out from the second step on."""

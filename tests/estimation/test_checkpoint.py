@@ -38,13 +38,13 @@ class Kept:
 def solved(monkeypatch):
     """How many steps were solved for, and of how many epochs."""
     sizes = []
-    solve = optimise._Step.solve
+    solve = optimise.Step.solve
 
     def counted(self, damping):
         sizes.append(len(self.problem.epochs.time_ns))
         return solve(self, damping)
 
-    monkeypatch.setattr(optimise._Step, "solve", counted)
+    monkeypatch.setattr(optimise.Step, "solve", counted)
     return sizes
 
 
