@@ -49,7 +49,8 @@ class TagFinder:
     shrink : int
         Search the means of blocks of so many pixels each way. The library's own decimation takes single pixels and
         reads the codes in the whole picture: on drawn pictures of 1280x960 with nine tags a search decimated by two
-        took 45 ms and one of the means of 2x2 pixels 29, by four 15 and 8, and both found the same tags.
+        took 45 ms and one of the means of 2x2 pixels 29, by four 15 and 8, and both found the same tags. The codes are
+        then read off those means, and have wrong bits: what is found so is a place to look at.
     """
 
     def __init__(self, families: Iterable[str], settings: DetectionSettings | None = None, shrink: int = 1):

@@ -14,8 +14,6 @@ fits the whole known print, and another id does not fit.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from math import hypot
 
 import numpy as np
 
@@ -23,12 +21,12 @@ from pipeline.detection.acceptance import KnownTags
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.found import sides_px
-from pipeline.detection.motion import Drift, Thumbnails
+from pipeline.detection.motion import Thumbnails
+from pipeline.detection.places import DECODER_TRIES, Span, Track, guesses_of, in_view, nearest, reach_px
 from pipeline.detection.prints import cells_across
 from pipeline.detection.refine import Refiner
 from pipeline.detection.seen import (
     NO_TRACK,
-    PIXELS_OF_FOLLOWED,
     SAME_SIDES,
     Seen,
     joined,
@@ -47,60 +45,10 @@ SWEEP_SHARE = 0.6
 some 25 px."""
 UNCERTAIN_S = 1.0
 """Between sweeps while the picture's motion cannot be told."""
-DECODER_TRIES = 2
-"""Frames after a tag was lost in which the decoder looks for it; after them only its correlation tells of it."""
 LOST_EVERY = 3
 """After them a lost tag is looked for in one in so many frames; from where it is found again it is followed back."""
 SURE = 0.6
 """Correlation of a place with which a tag that cannot be refined is still taken to be there, covered or blurred."""
-
-
-@dataclass
-class Track:
-    """A tag on its way through the frames of a span."""
-
-    number: int
-    family: str
-    tag_id: int
-    uv: np.ndarray
-    """(4, 2) where it was last, px."""
-    frame: int
-    """In which frame that was."""
-    step: np.ndarray | None = None
-    """(4, 2) velocity of its corners, px/s."""
-    lost: int = 0
-    """Frames since then."""
-    side_px: float = 0.0
-    centre: tuple[float, float] = (0.0, 0.0)
-
-    def __post_init__(self) -> None:
-        self.side_px, self.centre = _side_and_centre(self.uv)
-
-    def at(self, uv: np.ndarray, frame: int, seconds: float) -> None:
-        """Seen again, so many seconds later (negative on the way back)."""
-        self.step = (uv - self.uv) / seconds if self.lost <= 2 and seconds else None
-        self.uv, self.frame, self.lost = uv, frame, 0
-        self.side_px, self.centre = _side_and_centre(uv)
-
-
-def _side_and_centre(uv: np.ndarray) -> tuple[float, tuple[float, float]]:
-    """Mean side and centre of one quad, in plain numbers: arrays of four rows take ten times as long."""
-    (a, b), (c, d), (e, f), (g, h) = uv.tolist()
-    around = hypot(c - a, d - b) + hypot(e - c, f - d) + hypot(g - e, h - f) + hypot(a - g, b - h)
-    return 0.25 * around, (0.25 * (a + c + e + g), 0.25 * (b + d + f + h))
-
-
-class _Span:
-    """The frames between two searches, and what was seen in them so far."""
-
-    def __init__(self, greys: Sequence[np.ndarray], time_s: np.ndarray, drift: Drift):
-        self.greys, self.time_s = greys, np.asarray(time_s, float)
-        self.drift, self.certain = drift.uv, drift.certain
-        self.seen: list[list[Seen]] = [[] for _ in greys]
-        self.tracks = 0
-
-    def __len__(self) -> int:
-        return len(self.greys)
 
 
 class Follower:
@@ -140,10 +88,6 @@ class Follower:
         """Every tag of a picture, refined."""
         return search(grey, self._finder, self._refiner)
 
-    def _glimpse(self, grey: np.ndarray, finder: TagFinder) -> Seen:
-        # As good as the frames beside it: with all their pixels nine tags take as long as the glance that finds them.
-        return search(grey, finder, self._refiner, PIXELS_OF_FOLLOWED)
-
     def follow(self, greys: Sequence[np.ndarray], time_s: np.ndarray, first: Seen, last: Seen) -> list[Seen]:
         """What is seen in each frame of a span; it depends on nothing but the arguments.
 
@@ -160,12 +104,12 @@ class Follower:
         -------
         list of n Seen
         """
-        span = _Span(greys, time_s, self._thumbnails.drift(greys))
+        span = Span(greys, time_s, self._thumbnails.drift(greys))
         self._forward(span, first, last)
         self._backward(span)
         return [joined(parts) for parts in span.seen]
 
-    def _forward(self, span: _Span, first: Seen, last: Seen) -> None:
+    def _forward(self, span: Span, first: Seen, last: Seen) -> None:
         tracks: list[Track] = []
         self._take(span, 0, first, tracks)
         self._complete(span, 0, tracks)
@@ -174,17 +118,17 @@ class Follower:
             if k == len(span) - 1:
                 self._take(span, k, last, tracks)
             elif _sweep_is_due(span, swept, k):
-                self._take(span, k, self._glimpse(span.greys[k], self._sweeper), tracks)
+                self._meet(span, k, self._sweeper, tracks)
                 swept = glanced = k
             elif _glance_is_due(span, glanced, k):
-                self._take(span, k, self._glimpse(span.greys[k], self._glancer), tracks)
+                self._meet(span, k, self._glancer, tracks)
                 glanced = k
             waiting = [track for track in tracks if track.frame != k]
             ended = _add(span, k, self._advance(span, k, waiting))
             self._complete(span, k, tracks)
-            tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k)]
+            tracks = [track for track in tracks if track.number not in ended and in_view(track, span, k)]
 
-    def _backward(self, span: _Span) -> None:
+    def _backward(self, span: Span) -> None:
         tracks: list[Track] = []
         for k in range(len(span) - 1, 0, -1):
             before = {int(number) for part in span.seen[k - 1] for number in part.track}
@@ -201,9 +145,9 @@ class Follower:
             ended = _add(span, k - 1, self._advance(span, k - 1, tracks))
             self._complete(span, k - 1, tracks)
             ended |= before
-            tracks = [track for track in tracks if track.number not in ended and _in_view(track, span, k - 1)]
+            tracks = [track for track in tracks if track.number not in ended and in_view(track, span, k - 1)]
 
-    def _take(self, span: _Span, k: int, found: Seen, tracks: list[Track]) -> None:
+    def _take(self, span: Span, k: int, found: Seen, tracks: list[Track]) -> None:
         """What a search of frame k found, put on the tracks that lead to it or on new ones."""
         numbers = np.full(len(found), NO_TRACK)
         for i in range(len(found)):
@@ -211,21 +155,49 @@ class Follower:
             if tag_id not in self._known.get(family, ()):
                 continue
             same = [t for t in tracks if t.tag_id == tag_id and t.family == family and t.frame != k]
-            centre = found.uv[i].mean(axis=0)
-            away = [np.hypot(*(_guesses(t, span, k)[0].mean(axis=0) - centre)) for t in same]
-            side = float(sides_px(found.uv[i]))
-            seconds = span.time_s[k]
-            near = int(np.argmin(away)) if away else -1
-            if near >= 0 and (away[near] < side or same[near].lost):
-                same[near].at(found.uv[i], k, seconds - span.time_s[same[near].frame])
-                numbers[i] = same[near].number
+            near, away = nearest(same, span, k, found.uv[i])
+            if near is not None and (away < float(sides_px(found.uv[i])) or near.lost):
+                near.at(found.uv[i], k, span.time_s[k] - span.time_s[near.frame])
+                numbers[i] = near.number
             else:
                 tracks.append(Track(span.tracks, family, tag_id, found.uv[i], k))
                 numbers[i] = span.tracks
                 span.tracks += 1
         span.seen[k].append(found.on_tracks(numbers))
 
-    def _advance(self, span: _Span, k: int, tracks: Sequence[Track]) -> Seen:
+    def _meet(self, span: Span, k: int, finder: TagFinder, tracks: list[Track]) -> None:
+        """Let tracks begin, or go on where they were lost, where a sweep or a glance of frame k sees described tags;
+        others are told of.
+
+        They see places; what is there the refinement says, as of all that is followed. Codes read off so few pixels
+        have wrong bits: taken at their word they cost 86 of 4,591 rows of the sample log.
+        """
+        found = finder.find(span.greys[k])
+        back = span.drift[k - 1] - span.drift[k]
+        unknown = []
+        for i, (family, tag_id, uv) in enumerate(zip(found.family.tolist(), found.tag_id.tolist(), found.uv)):
+            if tag_id not in self._known.get(family, ()):
+                unknown.append(i)
+                continue
+            same = [track for track in tracks if track.tag_id == tag_id and track.family == family]
+            near, away = nearest(same, span, k, uv)
+            if near is not None and near.frame == k - 1 and away < float(sides_px(uv)):
+                continue  # it is being followed
+            if near is None or not (away < float(sides_px(uv)) or near.lost):
+                near = Track(span.tracks, family, tag_id, uv, k)
+                tracks.append(near)
+                span.tracks += 1
+            # As if it had been seen there in the frame before.
+            near.at(uv + back, k - 1, 0.0)
+        if unknown:
+            span.seen[k].append(
+                seen_at(
+                    span.greys[k], self._refiner, found.family[unknown], found.tag_id[unknown], found.uv[unknown],
+                    found.hamming[unknown], found.margin[unknown],
+                )
+            )  # fmt: skip
+
+    def _advance(self, span: Span, k: int, tracks: Sequence[Track]) -> Seen:
         """Look for some tracks in frame k; those found have moved on, the others are lost for a frame more."""
         due = [track for track in tracks if track.lost < DECODER_TRIES or track.lost % LOST_EVERY == 0]
         # In the order in which they are kept.
@@ -235,12 +207,12 @@ class Follower:
             track.lost += track.frame != k
         return seen
 
-    def _look(self, span: _Span, k: int, tracks: Sequence[Track]) -> Seen:
+    def _look(self, span: Span, k: int, tracks: Sequence[Track]) -> Seen:
         grey = span.greys[k]
         if not tracks:
             return seen_at(grey, self._refiner, [], [], np.zeros((0, 4, 2)))
-        guesses = [_guesses(track, span, k) for track in tracks]
-        reach = [_reach_px(track, span, k) for track in tracks]
+        guesses = [guesses_of(track, span, k) for track in tracks]
+        reach = [reach_px(track, span, k) for track in tracks]
         uv, score = self._locate(grey, tracks, guesses, reach)
         strayed = [i for i in range(len(tracks)) if score[i] < SURE and not tracks[i].lost]
         if strayed and len(strayed) < len(tracks):
@@ -287,7 +259,7 @@ class Follower:
             moved.at(seen.uv[i], k, span.time_s[k] - span.time_s[moved.frame])
         return seen
 
-    def _complete(self, span: _Span, k: int, tracks: list[Track]) -> None:
+    def _complete(self, span: Span, k: int, tracks: list[Track]) -> None:
         """Look for what is missing of the boards of which a part is seen in frame k."""
         if not self._boards:
             return
@@ -332,44 +304,7 @@ STILL_THERE = ("covered", "over-exposed", "under-exposed", "blurred", "cut by th
 """Reasons of the refinement that tell of a tag and not of its absence."""
 
 
-def _guesses(track: Track, span: _Span, k: int) -> list[np.ndarray]:
-    """Where a track may be in frame k, the likeliest first; (4, 2) each."""
-    places = [track.uv]
-    drift = span.drift[k] - span.drift[track.frame]
-    if np.abs(drift).max() > 0.5:
-        places.insert(0, track.uv + drift)
-    if track.step is not None and not track.lost:
-        places.insert(0, track.uv + track.step * (span.time_s[k] - span.time_s[track.frame]))
-    return places
-
-
-def _reach_px(track: Track, span: _Span, k: int) -> float:
-    """How far from its guesses a track is looked for: by how fast things move; little once it is lost."""
-    cell = track.side_px / cells_across(track.family)
-    still = 1.5 * cell + 3.0
-    if track.lost >= DECODER_TRIES:
-        return still
-    drift = float(np.abs(span.drift[k] - span.drift[track.frame]).max())
-    own = 0.0
-    if track.step is not None:
-        own = float(np.abs(track.step).max() * abs(span.time_s[k] - span.time_s[track.frame]))
-    return min(still + 4.0 + 0.3 * max(drift, own), 48.0)
-
-
-def _in_view(track: Track, span: _Span, k: int) -> bool:
-    """Whether a track's tag can be in frame k at all, by where it was and how the picture moved since."""
-    height, width = span.greys[k].shape
-    u, v = track.centre
-    if 0 <= u < width and 0 <= v < height:
-        return True
-    for place in _guesses(track, span, k):
-        u, v = place.sum(axis=0) / 4
-        if 0 <= u < width and 0 <= v < height:
-            return True
-    return False
-
-
-def _add(span: _Span, k: int, seen: Seen) -> set[int]:
+def _add(span: Span, k: int, seen: Seen) -> set[int]:
     """Put to frame k what is not there yet; the tracks of the rest, which another track has met, end."""
     if not span.seen[k] and len(set(zip(seen.family.tolist(), seen.tag_id.tolist()))) == len(seen):
         span.seen[k].append(seen)
@@ -387,7 +322,7 @@ def _add(span: _Span, k: int, seen: Seen) -> set[int]:
     return set(seen.track[~new].tolist())
 
 
-def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:
+def _track_from(span: Span, k: int, part: Seen, i: int) -> Track:
     """A track that leads back from a tag seen in frame k, with the speed it had after it."""
     number = int(part.track[i])
     track = Track(number, str(part.family[i]), int(part.tag_id[i]), part.uv[i], k)
@@ -398,19 +333,19 @@ def _track_from(span: _Span, k: int, part: Seen, i: int) -> Track:
     return track
 
 
-def _sweep_is_due(span: _Span, swept: int, k: int) -> bool:
+def _sweep_is_due(span: Span, swept: int, k: int) -> bool:
     if not np.all(span.certain[swept + 1 : k + 1]):
         return bool(span.time_s[k] - span.time_s[swept] >= UNCERTAIN_S)
     return _new_share(span, swept, k) > SWEEP_SHARE
 
 
-def _glance_is_due(span: _Span, glanced: int, k: int) -> bool:
+def _glance_is_due(span: Span, glanced: int, k: int) -> bool:
     return (
         bool(span.time_s[k] - span.time_s[glanced] >= GLANCE_S) or _new_share(span, glanced, k) > GLANCE_SHARE
     )
 
 
-def _new_share(span: _Span, before: int, k: int) -> float:
+def _new_share(span: Span, before: int, k: int) -> float:
     """Part of frame k that was not in view in an earlier frame."""
     height, width = span.greys[k].shape
     du, dv = span.drift[k] - span.drift[before]

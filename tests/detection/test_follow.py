@@ -9,8 +9,9 @@ from benchmarks._moving_tags import sequence
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
-from pipeline.detection.follow import Follower, _Span
+from pipeline.detection.follow import Follower
 from pipeline.detection.motion import Thumbnails
+from pipeline.detection.places import Span
 from pipeline.detection.refine import Refiner
 from pipeline.detection.seen import FOLLOWED, SEARCHED
 from pipeline.detection.windows import WindowDecoder
@@ -101,7 +102,7 @@ def test_a_track_that_stands_twice_in_a_frame_is_followed_back_once(shots):
     greys, time_s, _ = pictures(shots, 0, 3)
     one = follower()
     last = one.search(greys[-1])
-    span = _Span(greys, time_s, Thumbnails(*SIZE).drift(greys))
+    span = Span(greys, time_s, Thumbnails(*SIZE).drift(greys))
     on_track = last.on_tracks(np.arange(len(last)))
     span.seen[-1] += [on_track, on_track]
     span.tracks = len(last)
