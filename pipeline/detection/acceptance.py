@@ -27,17 +27,21 @@ KnownTags = Mapping[str, Set[int]]
 """Family -> ids that machine.toml and site.toml describe."""
 
 
-def judge(seen: Seen, known: KnownTags, settings: DetectionSettings) -> np.ndarray:
+def judge(
+    seen: Seen, known: KnownTags, settings: DetectionSettings, picture: np.ndarray | None = None
+) -> np.ndarray:
     """The status of each tag: ``accepted``, or the reason why not.
 
     Parameters
     ----------
     seen : Seen
-        n tags of one picture, as the refinement left them.
+        n tags, as the refinement left them.
     known : mapping
         Family -> ids that are described.
     settings : DetectionSettings
         Margin and bit errors that are let pass.
+    picture : (n,) int array, optional
+        Which picture each tag is in; without it all are in one.
 
     Returns
     -------
@@ -46,11 +50,14 @@ def judge(seen: Seen, known: KnownTags, settings: DetectionSettings) -> np.ndarr
     if not len(seen):
         return np.empty(0, object)
     described = np.array(
-        [int(number) in known.get(family, ()) for family, number in zip(seen.family, seen.tag_id)]
+        [
+            number in known.get(family, ())
+            for family, number in zip(seen.family.tolist(), seen.tag_id.tolist())
+        ]
     )
     # From the mildest reason to the gravest: the gravest is the one that is told.
     status = np.where(seen.reason == "", ACCEPTED, seen.reason)
-    status[_doubled(seen, settings)] = TWICE
+    status[_doubled(seen, settings, picture)] = TWICE
     status[seen.margin < settings.min_margin] = LOW_MARGIN
     status[seen.hamming > hamming_limits(seen, settings)] = BIT_ERRORS
     status[~described] = UNKNOWN_ID
@@ -59,11 +66,14 @@ def judge(seen: Seen, known: KnownTags, settings: DetectionSettings) -> np.ndarr
 
 def hamming_limits(seen: Seen, settings: DetectionSettings) -> np.ndarray:
     """(n,) int, bits that may have been corrected in each tag: fewer than the settings say where codes are short."""
-    return np.array([min(settings.max_hamming, hamming_limit(family)) for family in seen.family], int)
+    limits = {
+        family: min(settings.max_hamming, hamming_limit(family)) for family in set(seen.family.tolist())
+    }
+    return np.array([limits[family] for family in seen.family.tolist()], int)
 
 
-def _doubled(seen: Seen, settings: DetectionSettings) -> np.ndarray:
-    """Whether another tag of the same family and id is in the picture: then neither can be told apart.
+def _doubled(seen: Seen, settings: DetectionSettings, picture: np.ndarray | None) -> np.ndarray:
+    """Whether another tag of the same family and id is in the same picture: then neither can be told apart.
 
     The two files never describe a tag twice, so there are no two that belong there. A poor decoding does not count:
     it is more likely a mistake than a second print. Poor is what would be refused by itself, and also what had bits
@@ -77,9 +87,12 @@ def _doubled(seen: Seen, settings: DetectionSettings) -> np.ndarray:
     sound = ~(seen.margin < settings.min_margin) & (seen.hamming <= hamming_limits(seen, settings))
     sound &= (seen.reason != MISFIT) & (seen.reason != NO_CONTRAST)
     sound &= (seen.reason == "") | seen.decoded
-    places: dict[tuple[str, int], list[int]] = {}
-    for k in np.flatnonzero(sound).tolist():
-        places.setdefault((seen.family[k], int(seen.tag_id[k])), []).append(k)
+    places: dict[tuple[int, str, int], list[int]] = {}
+    where = np.zeros(len(seen), int) if picture is None else picture
+    names = zip(where.tolist(), seen.family.tolist(), seen.tag_id.tolist(), strict=True)
+    for k, (name, one) in enumerate(zip(names, sound.tolist())):
+        if one:
+            places.setdefault(name, []).append(k)
     for rows in places.values():
         if len(rows) == 1:
             continue

@@ -45,8 +45,9 @@ SWEEP_SHARE = 0.6
 some 25 px."""
 UNCERTAIN_S = 1.0
 """Between sweeps while the picture's motion cannot be told."""
-LOST_EVERY = 3
-"""After them a lost tag is looked for in one in so many frames; from where it is found again it is followed back."""
+LOST_EVERY = 5
+"""After them a lost tag is looked for in one in so many frames; from where it is found again it is followed back.
+With 3 nothing more was found, and following took 3 % longer."""
 SURE = 0.6
 """Correlation of a place with which a tag that cannot be refined is still taken to be there, covered or blurred."""
 

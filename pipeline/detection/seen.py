@@ -133,14 +133,15 @@ def search(grey: np.ndarray, finder: TagFinder, refiner: Refiner, pixels: int = 
     )
 
 
+def together(parts: Sequence[Seen]) -> Seen:
+    """All of some parts, in their order."""
+    return Seen(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in _SEEN})
+
+
 def joined(parts: Sequence[Seen]) -> Seen:
     """All that is seen in one frame, sorted by family, id and place."""
     assert parts
-    if len(parts) == 1:
-        whole = parts[0]
-    else:
-        columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _SEEN}
-        whole = Seen(**columns)
+    whole = parts[0] if len(parts) == 1 else together(parts)
     if len(whole) < 2:
         return whole
     keys = [

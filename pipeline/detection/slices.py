@@ -23,7 +23,7 @@ from pipeline.detection.decode import Pictures, decode_grey
 from pipeline.detection.follow import Follower
 from pipeline.detection.motion import Thumbnails
 from pipeline.detection.refine import Refiner
-from pipeline.detection.seen import Seen
+from pipeline.detection.seen import Seen, together
 from pipeline.detection.spans import Slice, spans_of
 from pipeline.detection.windows import WindowDecoder
 from pipeline.errors import ArtefactError, DetectionError
@@ -122,10 +122,14 @@ def search_slice(part: Slice, search: Search, reader: LogReader, finders: Finder
         if not pictures:
             continue
         seen, key = _follow(follower, pictures, key)
-        for (number, time_ns, _), tags in zip(pictures, seen):
-            if number != next_key:
-                status = judge(tags, search.known, search.settings)
-                rows.append(columns_of(tags, status, number, time_ns))
+        mine = [n for n, (number, _, _) in enumerate(pictures) if number != next_key]
+        if not mine:
+            continue
+        tags = together([seen[n] for n in mine])
+        each = [len(seen[n]) for n in mine]
+        of_frame = np.repeat(np.array([pictures[n][0] for n in mine], np.int32), each)
+        at_ns = np.repeat(np.array([pictures[n][1] for n in mine], np.int64), each)
+        rows.append(columns_of(tags, judge(tags, search.known, search.settings, of_frame), of_frame, at_ns))
     if missing := len(part.frame) - sum(outcomes.values()):
         outcomes[MISSING] = missing
     columns = tables.empty_columns("detections")
@@ -157,12 +161,13 @@ def _picture(frame: Frame, size: tuple[int, int], room: Pictures) -> tuple[np.nd
     return (grey, SEARCHED) if grey.shape[::-1] == size else (None, WRONG_SIZE)
 
 
-def columns_of(seen: Seen, status: np.ndarray, frame: int, time_ns: int) -> dict[str, np.ndarray]:
-    """Rows of the table `detections` for one frame."""
-    n = len(seen)
+def columns_of(
+    seen: Seen, status: np.ndarray, frame: np.ndarray, time_ns: np.ndarray
+) -> dict[str, np.ndarray]:
+    """Rows of the table `detections`; frame number and stamp of each tag."""
     columns: dict[str, np.ndarray] = {
-        "frame": np.full(n, frame, np.int32),
-        "time_ns": np.full(n, time_ns, np.int64),
+        "frame": frame,
+        "time_ns": time_ns,
         "family": seen.family,
         "tag_id": seen.tag_id.astype(np.int32),
         "side_px": seen.side_px,

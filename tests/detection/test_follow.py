@@ -97,6 +97,31 @@ def test_what_only_the_last_search_sees_is_followed_back(shots):
     assert set(seen[-1].how) == {SEARCHED}
 
 
+class Misreader:
+    """A glance as of few pixels: the places are right, two bits of each code are wrong."""
+
+    def __init__(self):
+        self._finder = TagFinder(FAMILY)
+
+    def find(self, grey):
+        found = self._finder.find(grey)
+        return replace(found, hamming=np.full(len(found), 2))
+
+
+def test_a_glance_tells_where_a_tag_is_and_the_picture_which_it_is(shots):
+    """Both searches are blinded: every row comes from a glance in the middle, and goes both ways from there."""
+    greys, time_s, _ = pictures(shots, 0, 20)
+    nothing = follower(finder=Blind()).search(greys[0])
+    seen = follower(glancer=Misreader()).follow(greys, time_s, nothing, nothing)
+    known = good_ids(follower().search(greys[15]))
+    rows = [len(part) for part in seen]
+    print(f"glanced at frame 15: {rows} rows per frame, {len(known)} in a search of it")
+    for part in seen:
+        assert set(part.how) == {FOLLOWED}
+        assert not part.hamming.any()
+        assert good_ids(part) - {0} == known - {0}  # 0 is half-covered in the first frames
+
+
 def test_a_track_that_stands_twice_in_a_frame_is_followed_back_once(shots):
     """As when a search and the rest of a board put one tag on one track; a drawn log died of it."""
     greys, time_s, _ = pictures(shots, 0, 3)
