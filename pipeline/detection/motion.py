@@ -19,6 +19,9 @@ THUMB_PX = 100
 """Widest thumbnail: 80x60 of 1280x960. Twice that is no surer and costs three times as much."""
 CERTAIN = 0.08
 """Height of the peak of the correlation below which pictures of a textured scene had nothing in common."""
+STANDS = 0.1
+"""Mean change between two thumbnails, over the standard deviation of the first, below which the scene stands: a camera
+that shakes by a pixel or two gives 0.06, and two large tags moving in front of one that stands had made 200 px of it."""
 FAR = 0.25
 """Part of the picture by which it may have moved on before another picture is compared with."""
 
@@ -67,8 +70,8 @@ class Thumbnails:
         return Drift(uv, certain)
 
     def _shift(self, before: np.ndarray, after: np.ndarray) -> tuple[np.ndarray, bool]:
-        # A scene that stands: nothing to transform, and noise cannot pretend to a motion.
-        if np.abs(after - before).mean() < 0.5:
+        # A scene that stands: nothing to transform, and what moves in it cannot pretend to a motion of the whole.
+        if np.abs(after - before).mean() < max(STANDS * before.std(), 0.5):
             return np.zeros(2), True
         shift, peak = cv2.phaseCorrelate(before, after, self._window)
         certain = peak > CERTAIN

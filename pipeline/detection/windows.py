@@ -35,7 +35,7 @@ ENOUGH = 0.7
 """Part of a print's cells that must lie in the picture: the white rim of a tag at the border may be cut off."""
 
 SMALL_PX = 25.0
-LARGE_PX = 80.0
+LARGE_PX = 50.0
 SHARPENING = 0.5
 """For enlarged windows: enlarging blurs."""
 
