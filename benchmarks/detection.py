@@ -43,7 +43,7 @@ START_NS = 1_700_000_000_000_000_000
 CAMERAS = ("left", "right")
 SAME_PX = 1.0
 SHIFT_FRAMES = 8 * 3600 * 2 * 10
-PASSES = 5
+PASSES = 10
 SLOPE_BAR = 1.0
 """MB a minute; a shift of eight hours would add 0.5 GB."""
 

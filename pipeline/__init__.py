@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import sys
 from pathlib import Path
 
 __version__ = "0.1.0.dev0"
@@ -22,6 +23,8 @@ def _keep_compiled_code_apart() -> None:
     if not os.access(home if home.exists() else package, os.W_OK):
         home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "gradetrace"
     os.environ["NUMBA_CACHE_DIR"] = str(home / f"compiled-{stamp.hexdigest()[:12]}")
+    if (config := sys.modules.get("numba.core.config")) is not None:
+        config.reload_config()  # numba was there before us
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
