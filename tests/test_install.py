@@ -142,7 +142,7 @@ def test_help_costs_less_than_300_ms():
 
 @pytest.mark.parametrize("first", ["import pipeline, numba", "import numba, pipeline"])
 def test_compiled_code_lies_in_a_folder_of_its_own_whoever_loads_the_compiler(first):
-    """numba keeps it by file and does not see that a function called from another file has changed."""
+    """Numba keeps it by file and does not see that a function called from another file has changed."""
     code = f"import os; os.environ.pop('NUMBA_CACHE_DIR', None); {first}; print(numba.config.CACHE_DIR)"
     folder = run(sys.executable, "-c", code).strip()
     print(folder)

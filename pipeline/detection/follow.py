@@ -2,7 +2,7 @@
 
 A search of a whole frame costs twenty times what decoding it costs, a window of one known tag a tenth. So a span of
 frames is searched whole at its first and its last frame; in between it is swept with half the resolution where the
-picture has moved on, and a glance with a fifth of it now and then finds what comes and goes. What is found is
+picture has moved on, and a glance with a quarter of it now and then finds what comes and goes. What is found is
 followed. Forward first; what a later search found and the frames before it have not is then followed backward, until
 it is met or the span ends.
 
@@ -36,8 +36,9 @@ from pipeline.detection.seen import (
 from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
 GLANCE_S = 1.5
-"""Between two glances: searches of the means of 5x5 pixels. They take a fifteenth of a search and miss tags under some
-55 px; what comes from behind something and goes again within a span is found by them."""
+"""Between two glances: searches of the means of 4x4 pixels. They take a twelfth of a search and miss tags under some
+45 px; what comes from behind something and goes again within a span is found by them. With 5x5
+pixels 118 of 5,442 rows were missed."""
 GLANCE_SHARE = 0.15
 """Part of the picture that was not in view at the last glance, from which on the next one is due."""
 SWEEP_SHARE = 0.6
@@ -58,7 +59,7 @@ class Follower:
     Parameters
     ----------
     finder, sweeper, glancer : TagFinder
-        Search a picture: every pixel of it, a quarter and a twenty-fifth of them.
+        Search a picture: every pixel of it, a quarter and a sixteenth of them.
     refiner : Refiner
     decoder : WindowDecoder
     thumbnails : Thumbnails

@@ -36,7 +36,7 @@ WRONG_SIZE = "wrong size"
 MISSING = "not found again"
 LOST = "lost with a worker"
 
-GLANCE_SHRINK, SWEEP_SHRINK = 5, 2
+GLANCE_SHRINK, SWEEP_SHRINK = 4, 2
 
 
 @dataclass(frozen=True)
