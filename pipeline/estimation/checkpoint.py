@@ -90,13 +90,13 @@ class Iterations:
     checkpoint: Checkpoint = FORGETFUL
     name: str = ""
 
-    def recall(self) -> tuple[Values, np.ndarray, int, float, bool, bool] | None:
-        """Values, damping, steps taken, their last length, and whether converged and patient: after the last step."""
+    def recall(self) -> tuple[Values, np.ndarray, int, float, float, bool, bool] | None:
+        """Values, damping, steps taken, the last one's length and what it left, whether converged and patient."""
         found = self.checkpoint.recall(self.name)
         if found is None:
             return None
-        used, sigmas, converged, patient = found["state"].tolist()
-        return values_of(found), found["damping"], int(used), sigmas, bool(converged), bool(patient)
+        used, sigmas, left, converged, patient = found["state"].tolist()
+        return values_of(found), found["damping"], int(used), sigmas, left, bool(converged), bool(patient)
 
     def keep(self, values: Values, damping, *state) -> None:
         self.checkpoint.keep(

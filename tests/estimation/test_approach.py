@@ -107,6 +107,25 @@ def test_a_log_that_was_approached_ends_where_it_does_from_its_start(problem, pl
     print(f"{near.iterations} steps of everything, {plain.iterations} from the start")
 
 
+def test_near_enough_ends_a_step_earlier_and_no_further_off_than_it_says(problem, plain):
+    sigma = np.sqrt(np.diagonal(marginals(problem, plain.values, plain.weights).P_zz))
+    start = replace(plain.values, z=plain.values.z + 0.3 * sigma)
+    whole = iterations._iterate(problem, start, plain.weights, 40, 0)
+    early = iterations._iterate(problem, start, plain.weights, 40, 0, near_enough=True)
+    off = np.abs((early[0].z - whole[0].z) / sigma).max()
+    print(f"{early[1]} steps instead of {whole[1]}, {off:.5f} sigma off, said to be {early[3]:.5f} at most")
+    assert early[2] and early[1] < whole[1]
+    assert off < early[3] < iterations.STEP_SIGMAS
+
+
+def test_statics_thousands_of_sigmas_off_are_brought_back_and_it_is_told(problem, plain):
+    sigma = np.sqrt(np.diagonal(marginals(problem, plain.values, plain.weights).P_zz))
+    start = replace(plain.values, z=plain.values.z + 3.0 * sigma)  # together, though they are known by their sums
+    _, used, converged, _, cost = iterations._iterate(problem, start, plain.weights, 40, 0)
+    print(f"{used} steps")
+    assert converged and cost == pytest.approx(plain.cost, rel=1e-9)
+
+
 def test_states_that_follow_span_by_span_are_those_that_follow_as_one(problem, plain, monkeypatch):
     """A span ends in the gap; where it ends is not to be seen, for 100 epochs on either side are adjusted with it."""
     weights = keep_all(problem, HUBER)
