@@ -141,10 +141,10 @@ class Stage:
 
 STAGES = (
     Stage("ingest", 1, "reading the log", (), ("log",), ("frames", "sensors"), _reading),
-    Stage("detect", 5, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
+    Stage("detect", 6, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        14,
+        15,
         "adjusting the network",
         ("ingest", "detect"),
         (),

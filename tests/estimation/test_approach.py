@@ -120,7 +120,8 @@ def test_near_enough_ends_a_step_earlier_and_no_further_off_than_it_says(problem
 
 def test_statics_thousands_of_sigmas_off_are_brought_back_and_it_is_told(problem, plain):
     sigma = np.sqrt(np.diagonal(marginals(problem, plain.values, plain.weights).P_zz))
-    start = replace(plain.values, z=plain.values.z + 3.0 * sigma)  # together, though they are known by their sums
+    # Together, though they are known by their sums.
+    start = replace(plain.values, z=plain.values.z + 3.0 * sigma)
     _, used, converged, _, cost = iterations._iterate(problem, start, plain.weights, 40, 0)
     print(f"{used} steps")
     assert converged and cost == pytest.approx(plain.cost, rel=1e-9)
