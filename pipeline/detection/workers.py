@@ -34,7 +34,11 @@ LOST_SLICES = 3
 
 
 def search_slices(
-    search: Search, slices: Sequence[Slice], workers: int, done: Callable[[Slice], None] | None = None
+    search: Search,
+    slices: Sequence[Slice],
+    workers: int,
+    done: Callable[[Slice], None] | None = None,
+    begun: Callable[[], None] | None = None,
 ) -> None:
     """Write the piece of every slice that has none yet.
 
@@ -48,6 +52,8 @@ def search_slices(
         Processes; with 1 the work is done in this one.
     done : callable
         Told each slice when its piece is there, also those that were there before.
+    begun : callable
+        Called when all is compiled, which the first run takes a minute for, and the first slice begins.
 
     Raises
     ------
@@ -58,14 +64,16 @@ def search_slices(
     """
     report = done or (lambda _: None)
     waiting = undone(slices)
-    left = {(part.camera, part.number) for part in waiting}
-    for part in slices:
-        if (part.camera, part.number) not in left:
-            report(part)
     # An interrupt that comes while something compiles, or is loaded, is lost in a callback of the compiler.
     if waiting:
         with _interrupts_held():
             warm_up(search)
+    if begun is not None:
+        begun()
+    left = {(part.camera, part.number) for part in waiting}
+    for part in slices:
+        if (part.camera, part.number) not in left:
+            report(part)
     if workers <= 1 or len(slices) <= 1:
         with read_log(search.log, search.contents) as reader:
             finders = Finders(search)

@@ -53,8 +53,15 @@ def run(job: Job, progress: Progress) -> Counts:
     search = Search(
         job.log, contents, tuple(sorted(known)), known, sizes, job.site.detection, intrinsics, boards(job)
     )
-    progress.total(sum(len(part.frame) for part in slices), "frames")
-    search_slices(search, slices, job.workers, lambda part: progress.advance(len(part.frame)))
+    in_all = sum(len(part.frame) for part in slices)
+    search_slices(
+        search,
+        slices,
+        job.workers,
+        lambda part: progress.advance(len(part.frame)),
+        # What compiling takes is no measure of the time that remains.
+        lambda: progress.total(in_all, "frames"),
+    )
 
     for part in given_up(slices):
         start, end = (datetime.fromtimestamp(int(t) / 1e9, UTC) for t in (part.time_ns[0], part.time_ns[-1]))

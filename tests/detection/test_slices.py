@@ -145,6 +145,22 @@ def test_workers_that_vanish_whatever_they_do_end_the_job(shift, tmp_path, monke
         search_slices(gone, slices, 2)
 
 
+def test_work_is_told_to_begin_when_all_is_compiled_and_before_any_slice(shift, tmp_path, monkeypatch):
+    """The time that remains is reckoned from there; a first run compiles for a minute."""
+    told = []
+    monkeypatch.setattr(workers_module, "warm_up", lambda search: told.append("compiled"))
+    slices = slices_of(frames_table(shift), TOPICS, SIZES, tmp_path, SLICE_S)
+    search_slices(
+        search_of(shift), slices, 1, lambda part: told.append("slice"), lambda: told.append("begun")
+    )
+    assert told == ["compiled", "begun"] + ["slice"] * len(slices)
+    told.clear()
+    search_slices(
+        search_of(shift), slices, 1, lambda part: told.append("slice"), lambda: told.append("begun")
+    )
+    assert told == ["begun"] + ["slice"] * len(slices)
+
+
 class Deadly(dict):
     """A table of sizes that ends the process which asks for the size of one camera's pictures."""
 
