@@ -37,8 +37,8 @@ from pipeline.detection.windows import POSSIBLE, WindowDecoder, locate
 
 GLANCE_S = 1.5
 """Between two glances: searches of the means of 4x4 pixels. They take a twelfth of a search and miss tags under some
-45 px; what comes from behind something and goes again within a span is found by them. With 5x5
-pixels 118 of 5,442 rows were missed."""
+45 px; what comes from behind something and goes again within a span is found by them. With 5x5 pixels 118 of 5,442 rows
+were missed, every 2.5 s 37 of 10,860."""
 GLANCE_SHARE = 0.15
 """Part of the picture that was not in view at the last glance, from which on the next one is due."""
 SWEEP_SHARE = 0.6

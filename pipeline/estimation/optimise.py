@@ -223,14 +223,9 @@ def _followed(problem: Problem, values: Values, weights: Weights, irls: int) -> 
 
 
 def _iterate(
-    problem: Problem,
-    values: Values,
-    weights: Weights,
-    limit: int,
-    irls: int,
-    log: Iterations = UNKEPT,
-    near_enough=False,
-):
+    problem: Problem, values: Values, weights: Weights, limit: int, irls: int,
+    log: Iterations = UNKEPT, near_enough=False
+):  # fmt: skip
     """Steps until they are short; or, where near is enough, until the next one would be by how the last ones went."""
     E = len(problem.epochs.time_ns)
     stretch = np.arange(E) // STRETCH
@@ -286,8 +281,7 @@ def _iterate(
         values = trial
         worse = rise > 0.1 * np.bincount(stretch, local) + 10.0
         local, prior = trial_local, trial_prior
-        # The next one would be as much shorter than this as this is than the last.
-        left = sigmas * min(sigmas / before, 1.0) if near_enough and np.isfinite(before) else sigmas
+        left = left_after(sigmas, before) if near_enough and np.isfinite(before) else sigmas
         converged = bool(left < STEP_SIGMAS and shorten == 1.0 and np.all(damping < 1e-5) and risky is None)
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
@@ -297,6 +291,11 @@ def _iterate(
     if risky is not None and not converged:
         values, local, prior = risky.values, risky.local, risky.prior
     return values, used, converged, left, local.sum() + prior
+
+
+def left_after(sigmas: float, before: float) -> float:
+    """Length of the next step: as much shorter than this one as this is than the one before."""
+    return sigmas * min(sigmas / before, 1.0)
 
 
 def _raised(damping):

@@ -67,8 +67,7 @@ def unpulled(problem: Problem, optimum: optimise.Optimum) -> optimise.Optimum:
         if np.any(step.damping):  # nor could the covariances be had
             break
         values = step.taken(1.0)
-        # The next one would be as much shorter than this as this is than the last.
-        left = step.longest * min(step.longest / before, 1.0)
+        left = optimise.left_after(step.longest, before)
         if left < optimise.STEP_SIGMAS:
             local, prior = cost_of(problem, values, optimum.weights)
             return replace(

@@ -56,6 +56,12 @@ def test_of_several_reasons_the_gravest_is_told():
     assert statuses((7, 100, 100, {**poor, "hamming": 2})) == ["unknown id"]
 
 
+def test_the_same_tag_in_another_picture_is_no_second_one():
+    tags = seen((1, 100, 100), (1, 300, 100), (1, 500, 100), (2, 100, 300))
+    status = judge(tags, {"tag36h11": {1, 2, 3}}, SETTINGS, np.array([7, 8, 8, 8]))
+    assert status.tolist() == ["accepted", "twice in one frame", "twice in one frame", "accepted"]
+
+
 def test_what_the_print_does_not_fit_is_no_second_print():
     assert statuses((1, 100, 100), (1, 300, 100, {"reason": "does not fit"})) == ["accepted", "does not fit"]
     assert statuses((1, 100, 100), (1, 300, 100, {"reason": "covered"})) == ["twice in one frame"] * 2
