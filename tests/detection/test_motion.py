@@ -43,3 +43,17 @@ def test_a_scene_that_stands_does_not_drift_at_all():
     ground = texture(rng, 640, 480)
     greys = [np.clip(ground + rng.normal(0, 3, ground.shape), 0, 255).astype(np.uint8) for _ in range(5)]
     assert np.all(Thumbnails(640, 480).drift(greys).uv == 0)
+
+
+def test_what_moves_before_a_scene_that_stands_is_no_motion_of_the_whole():
+    """Two prints of 120 px on their way; their phases tell of 8 px."""
+    rng = np.random.default_rng(7)
+    ground = texture(rng, 1280, 960)
+    cells = np.kron(rng.integers(0, 2, (10, 10)), np.ones((12, 12))) * 200 + 20
+    greys = []
+    for k in range(4):
+        shown = ground.copy()
+        for left, top in ((200 + 12 * k, 300), (700 + 12 * k, 500)):
+            shown[top : top + 120, left : left + 120] = cells
+        greys.append(np.clip(shown + rng.normal(0, 2, shown.shape), 0, 255).astype(np.uint8))
+    assert np.all(Thumbnails(1280, 960).drift(greys).uv == 0)
