@@ -34,8 +34,7 @@ from pipeline.config import Machine, Site
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.marginals import body_track, common_part, marginals_by_part
-from pipeline.estimation.optimise import optimise
-from pipeline.estimation.pull import unpulled
+from pipeline.estimation.optimise import optimise, unpulled
 from pipeline.geometry import se3, so3
 from pipeline.network import Network, Observations, network_of
 from pipeline.network import frames as fr

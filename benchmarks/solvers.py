@@ -35,9 +35,10 @@ from benchmarks import _gtsam, _scipy
 from benchmarks._results import keep_result
 from benchmarks._two_carriers import NO_LOSS, problem_of_two
 from pipeline.estimation import arrow
+from pipeline.estimation.gauss_newton import deltas_of
 from pipeline.estimation.marginals import marginals, marginals_by_part
 from pipeline.estimation.normal import cost_by_epoch, linearise
-from pipeline.estimation.optimise import IRLS_STEPS, _approached, _iterate, deltas_of
+from pipeline.estimation.optimise import IRLS_STEPS, _approached, _iterate
 from pipeline.estimation.problem import Problem, keep_all
 from pipeline.estimation.values import Values
 from pipeline.geometry import se3

@@ -12,10 +12,9 @@ from pipeline.estimation import diagnostics, observability
 from pipeline.estimation.checkpoint import FORGETFUL, Checkpoint
 from pipeline.estimation.densities import described, shaking, spells
 from pipeline.estimation.likelihood import log_likelihood
-from pipeline.estimation.optimise import Optimum, optimise
+from pipeline.estimation.optimise import Optimum, optimise, unpulled
 from pipeline.estimation.problem import Problem, problem_of
 from pipeline.estimation.published import published
-from pipeline.estimation.pull import unpulled
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.estimation.repeated import WHITE, Repeated, with_offsets
 from pipeline.estimation.self_check import examine

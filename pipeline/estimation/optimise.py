@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from pipeline import threads
 from pipeline.errors import EstimationError
-from pipeline.estimation import approach, gates, sweeps
+from pipeline.estimation import approach, gates, pull
 from pipeline.estimation.checkpoint import (
     FORGETFUL,
     UNKEPT,
@@ -21,9 +20,9 @@ from pipeline.estimation.checkpoint import (
     values_of,
     weights_of,
 )
-from pipeline.estimation.linearised import KEPT_PARTS, cost_of, parts, pieces
-from pipeline.estimation.normal import linearised_along
-from pipeline.estimation.parts import PART_EPOCHS, Part, bounds, joined, part_of
+from pipeline.estimation.gauss_newton import STEP_SIGMAS, Step, left_after
+from pipeline.estimation.linearised import cost_of, parts
+from pipeline.estimation.parts import PART_EPOCHS, bounds, joined, part_of
 from pipeline.estimation.parts import cut as cut_of
 from pipeline.estimation.problem import Problem, Weights, keep_all, unchecked_statics
 from pipeline.estimation.values import Values
@@ -35,8 +34,6 @@ DAMPING_FIRST, DAMPING_UP, DAMPING_DOWN, DAMPING_NONE, DAMPING_MOST = 1e-6, 30.0
 """Shares of the diagonal. Nearly all of it is motion prior, which neighbouring epochs cancel: what holds a gap as a
 whole is a millionth of it. More than the most holds no better and takes as many steps to go as it took to come: from
 statics 10,000 sigmas off it had reached 1e88, and the optimum, found in 12 steps, was never told as such."""
-STEP_SIGMAS = 0.05
-"""Converged when no unknown moves by more of its posterior sigma; see ``sweeps.Reduced.longest``."""
 NEAR_STEPS = 3
 """Steps of the states with the statics of a sample: 1e5, 500 and 10 sigmas, and 5 are left to the statics."""
 SPAN, MARGIN = 3 * PART_EPOCHS, 128
@@ -56,8 +53,6 @@ SPREAD, SPREAD_OVER = 0.5, 100
 """Share of the stretches, and how many at least, from which a rise is the statics' doing: then the step is shortened,
 and nothing damped."""
 TRIES = 14
-HOLD = 1e12
-"""Information that keeps an unchecked static where it is during the steps; a prior is 1. Not for covariances."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,6 +92,7 @@ def optimise(
     near : bool
         The start is the optimum of other variances: no sample is asked first. Where densities fell thirtyfold, Newton's
         steps alone were 145 sigmas off after two, and 35 followed; after two of re-weighting it is 3, and 10 follow.
+        The states of a long log follow the statics first instead.
     checkpoint, name
         Where finished iterations are kept, and under which name.
 
@@ -109,60 +105,85 @@ def optimise(
         return _optimum_of(done, keep_all(problem, huber))
     optimum = _optimised(problem, huber, max_iterations, near, checkpoint, name)
     checkpoint.keep(f"{name} optimum", _arrays_of_optimum(optimum))
-    for kept in ("approach", *range(GATE_ROUNDS)):
+    for kept in ("approach", *(f"{n}{steps}" for n in range(GATE_ROUNDS) for steps in ("", " freed"))):
         checkpoint.forget(f"{name} {kept}")
     return optimum
 
 
+def unpulled(problem: Problem, optimum: Optimum) -> Optimum:
+    """The optimum with the statics that the measurements tell without the motion prior, and states that follow.
+
+    Where the steps to them do not end it comes back as it was, its covariances too, with a remark.
+    """
+    if optimum.eased or not optimum.converged or problem.statics.size == 0:
+        return optimum
+    found = pull.freed(problem, optimum.values, optimum.weights, pull.STEPS)
+    if found is None or not found[2]:
+        return replace(optimum, remark=pull.NOT_FREED)
+    values, used, _, left, cost = found
+    used += optimum.iterations
+    return replace(optimum, values=values, iterations=used, last_step_sigmas=left, cost=cost, eased=True)
+
+
 def _optimised(problem: Problem, huber: float, max_iterations: int, near, checkpoint, name) -> Optimum:
-    values, weights = problem.first, keep_all(problem, huber)
+    weights = keep_all(problem, huber)
     aside: list[np.ndarray] = []
-    approached = False
     if (kept := checkpoint.recall(f"{name} approach")) is not None:
         values, approached = values_of(kept), True
-    elif not near:
-        values, approached = _approached(problem, weights, max_iterations)
+    else:
+        values, approached = _approached(problem, weights, max_iterations, near)
         if approached:
             checkpoint.keep(f"{name} approach", arrays_of(values))
-    iterations, converged, sigmas, cost = 0, False, np.inf, np.inf
+    at = Optimum(values, weights, 0, False, np.inf, np.inf)
     for round_ in range(GATE_ROUNDS):
-        limit = max_iterations - iterations
         followed = round_ == 1 and approached
-        if followed:
-            # Of a long log the few pictures in doubt tell nothing about the statics.
-            values = _followed(problem, values, weights, 0)
-        else:
-            if round_ and approached:
-                # Those whose pictures came or went; without it all took three steps, of 4, 2 and 0.02 sigmas.
-                values = _followed(problem, values, weights, 0)
-            values, used, converged, sigmas, cost = _iterate(
-                problem,
-                values,
-                weights,
-                limit,
-                0 if approached or round_ else IRLS_STEPS,
-                Iterations(checkpoint, f"{name} {round_}"),
-                near_enough=approached,
-            )
-            iterations += used
-        gated, fits = gates.gross(parts(problem, values, weights), problem, weights)
+        if round_ and approached:
+            # Those whose pictures came or went; without it all took three steps, of 4, 2 and 0.02 sigmas.
+            at = replace(at, values=_followed(problem, at.values, weights, 0))
+        if not followed:  # of a long log the few pictures in doubt tell nothing about the statics
+            irls = 0 if approached or round_ else IRLS_STEPS
+            log = Iterations(checkpoint, f"{name} {round_}")
+            at = _settled(problem, replace(at, weights=weights), max_iterations, irls, log, approached)
+        gated, fits = gates.gross(parts(problem, at.values, weights), problem, weights)
         # Doubted once, at Huber's optimum; what no flip explains comes back for good.
-        aside = gates.doubtful(problem, fits) if round_ == 0 else gates.flipped(problem, values, aside)
+        aside = gates.doubtful(problem, fits) if round_ == 0 else gates.flipped(problem, at.values, aside)
         gated = gates.without(gated, aside)
         settled = not followed and _same(gated, weights)
-        if settled or not converged or iterations >= max_iterations or round_ == GATE_ROUNDS - 1:
+        if settled or not at.converged or at.iterations >= max_iterations or round_ == GATE_ROUNDS - 1:
             break
         if round_ == 0:
-            huber_s = Optimum(values, weights, iterations, converged, sigmas, cost)
+            huber_s = at
         elif _same(gated, huber_s.weights):
             # Nothing gross, and doubted for nothing: that optimum is known.
-            return replace(huber_s, iterations=iterations)
+            return replace(huber_s, iterations=at.iterations)
         weights = gated
-    return Optimum(values, weights, iterations, converged, sigmas, cost)
+    return replace(at, weights=weights)
+
+
+def _settled(
+    problem: Problem, at: Optimum, limit: int, irls: int, log: Iterations, approached: bool
+) -> Optimum:
+    """Steps of everything with the weights as they are, from where the values are.
+
+    In a long log they are those without the pull of the motion prior: with it, and then without, 100,000 epochs took
+    steps of 21, 12 and 0.3 sigmas, and 14, 13 and 0.4 more.
+    """
+    limit -= at.iterations
+    found, eased = None, approached and problem.statics.size > 0
+    if eased:
+        of_freed = Iterations(log.checkpoint, f"{log.name} freed")
+        found = pull.freed(problem, at.values, at.weights, limit, of_freed)
+    if found is None:
+        eased, found = (
+            False,
+            _iterate(problem, at.values, at.weights, limit, irls, log, near_enough=approached),
+        )
+    values, used, converged, left, cost = found
+    return Optimum(values, at.weights, at.iterations + used, converged, left, cost, eased)
 
 
 def _arrays_of_optimum(optimum: Optimum) -> Arrays:
-    state = [optimum.iterations, optimum.converged, optimum.last_step_sigmas, optimum.cost]
+    state = [optimum.iterations, optimum.converged, optimum.last_step_sigmas, optimum.cost, optimum.eased]
     return {
         **arrays_of(optimum.values),
         **arrays_of_weights(optimum.weights),
@@ -171,9 +192,9 @@ def _arrays_of_optimum(optimum: Optimum) -> Arrays:
 
 
 def _optimum_of(arrays: Arrays, like: Weights) -> Optimum:
-    iterations, converged, sigmas, cost = arrays["state"].tolist()
-    weights = weights_of(arrays, like)
-    return Optimum(values_of(arrays), weights, int(iterations), bool(converged), sigmas, np.float64(cost))
+    iterations, converged, sigmas, cost, eased = arrays["state"].tolist()
+    values, weights = values_of(arrays), weights_of(arrays, like)
+    return Optimum(values, weights, int(iterations), bool(converged), sigmas, np.float64(cost), bool(eased))
 
 
 def _same(a: Weights, b: Weights) -> bool:
@@ -181,17 +202,25 @@ def _same(a: Weights, b: Weights) -> bool:
     return all(np.array_equal(*pair) for pair in pairs)
 
 
-def _approached(problem: Problem, weights: Weights, max_iterations: int) -> tuple[Values, bool]:
-    """The start of a long log with the statics of a sample of it, and states that follow these; and whether it is."""
+def _approached(
+    problem: Problem, weights: Weights, max_iterations: int, near: bool = False
+) -> tuple[Values, bool]:
+    """The start of a long log with the statics of a sample of it, and states that follow these; and whether it is.
+
+    A start that is near has such statics already.
+    """
     taken = approach.sample(problem, weights)
     if taken is None:
         return problem.first, False
-    short, of_short = taken
+    z = problem.first.z
     try:
-        found, _, converged, _, _ = _iterate(short, short.first, of_short, max_iterations, IRLS_STEPS)
-        if not converged:
-            return problem.first, False
-        return _followed(problem, replace(problem.first, z=found.z), weights, IRLS_STEPS), True
+        if not near:
+            short, of_short = taken
+            found, _, converged, _, _ = _iterate(short, short.first, of_short, max_iterations, IRLS_STEPS)
+            if not converged:
+                return problem.first, False
+            z = found.z
+        return _followed(problem, replace(problem.first, z=z), weights, IRLS_STEPS), True
     except EstimationError:
         return problem.first, False  # what a sample cannot tell, the whole log may
 
@@ -281,7 +310,7 @@ def _iterate(
         values = trial
         worse = rise > 0.1 * np.bincount(stretch, local) + 10.0
         local, prior = trial_local, trial_prior
-        left = left_after(sigmas, before) if near_enough and np.isfinite(before) else sigmas
+        left = left_after(sigmas, before) if near_enough else sigmas
         converged = bool(left < STEP_SIGMAS and shorten == 1.0 and np.all(damping < 1e-5) and risky is None)
         damping *= DAMPING_DOWN
         damping[damping < DAMPING_NONE] = 0.0
@@ -293,23 +322,12 @@ def _iterate(
     return values, used, converged, left, local.sum() + prior
 
 
-def left_after(sigmas: float, before: float) -> float:
-    """Length of the next step: as much shorter than this one as this is than the one before."""
-    return sigmas * min(sigmas / before, 1.0)
-
-
 def _raised(damping):
     return np.clip(damping * DAMPING_UP, DAMPING_FIRST, DAMPING_MOST)
 
 
 def _spread(risen) -> bool:
     return bool(np.sum(risen) > max(SPREAD * len(risen), SPREAD_OVER))
-
-
-def deltas_of(problem: Problem, dx) -> list[np.ndarray]:
-    """Chain steps, cut up by variable."""
-    places = [problem.place(k) for k in range(len(problem.tie.variables))]
-    return [dx[c][:, at] for c, at in places]
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,77 +340,3 @@ class _Risky:
     pull: float
     risen: np.ndarray
     """(stretches,) bool: where it rose."""
-
-
-class Step:
-    """The Gauss-Newton step at one point, solved for as often as the damping changes.
-
-    With ``ease`` its statics' part is that of ``pull``, and the states follow.
-    """
-
-    def __init__(
-        self,
-        problem: Problem,
-        values: Values,
-        weights: Weights,
-        held,
-        newton: bool,
-        ease: float | None = None,
-    ):
-        self.problem, self.values = problem, values
-        self.cut = cut = parts(problem, values, weights)
-        self.damping = damping = np.zeros(len(problem.epochs.time_ns))
-
-        def finish(i: int, piece: sweeps.Piece) -> sweeps.Piece:
-            # Knows nothing of self: in a cycle with it, the parts of every step so far would wait for the collector.
-            C = piece.C
-            if i == 0 and len(held):
-                C = C.copy()
-                C[held, held] += HOLD
-            return replace(piece, C=C, damping=damping[cut[i].with_far_end])
-
-        self.pieces, self.eased = pieces(cut, newton, finish, ease), ease is not None
-
-        def follow(dz, i: int) -> sweeps.Piece:
-            of = cut[i]
-            chains = linearised_along(of.problem, of.values, of.weights, dz, newton)
-            return sweeps.Piece(tuple(chains), dz[:0], dz[:0], of.epochs, damping[of.with_far_end])
-
-        # A short log is linearised once. Without a border there is nothing to spare either.
-        self.follow = None if len(cut) <= KEPT_PARTS or not problem.statics.size else follow
-
-    def solve(self, damping) -> None:
-        """Solve; where rounding leaves the matrix indefinite, everything is damped a little."""
-        for extra in (0.0, 1e-9, 1e-6, 1e-3):
-            self.damping[:] = damping + extra
-            try:
-                if self.eased:
-                    reduced, alone = sweeps.reduce_twice(self.pieces, len(self.cut))
-                    reduced = replace(reduced, dz=alone.dz, pull=alone.pull)
-                else:
-                    reduced = sweeps.reduce(self.pieces, len(self.cut))
-            except np.linalg.LinAlgError:
-                continue
-            break
-        else:
-            raise EstimationError(
-                "the normal equations of this log cannot be solved: measurements contradict each other beyond what "
-                "the stated sigmas allow, or a sigma in machine.toml or site.toml is wrong by orders of magnitude"
-            )
-        self.dz, self.longest, self.pull = reduced.dz, reduced.longest, reduced.pull
-        E = len(self.problem.epochs.time_ns)
-        self.deltas = [np.empty((E, v.size)) for v in self.problem.tie.variables]
-        following = self.pieces if self.follow is None else partial(self.follow, reduced.dz)
-        for i, dx in sweeps.steps(following, reduced):
-            part = self.cut[i]
-            for delta, of_part in zip(self.deltas, deltas_of(self.problem, dx), strict=True):
-                delta[part.start : part.stop] = of_part[: part.epochs]
-
-    def taken(self, shorten: float) -> Values:
-        """The values after a share of the step."""
-
-        def moved_part(part: Part) -> Values:
-            return part.own_values.retract([shorten * d[part.start : part.stop] for d in self.deltas], 0.0)
-
-        moved = joined(threads.each(moved_part, self.cut))
-        return replace(moved, z=self.values.z + shorten * self.dz)

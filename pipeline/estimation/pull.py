@@ -27,56 +27,63 @@ slope; densities a hundred times larger throughout, with which the first slope s
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from pipeline.errors import EstimationError
-from pipeline.estimation import optimise
+from pipeline.estimation.checkpoint import UNKEPT, Iterations
+from pipeline.estimation.gauss_newton import STEP_SIGMAS, Step, left_after
 from pipeline.estimation.linearised import cost_of
-from pipeline.estimation.problem import Problem, unchecked_statics
+from pipeline.estimation.problem import Problem, Weights, unchecked_statics
+from pipeline.estimation.values import Values
 
 EASE = 1e3
 """Of the pull 25 % is left with 10, 6 % with 100, 2 % with this and with 1e6. Sigmas of statics rise by 0.5 % at most
 in networks d, f and g, by 2.5 % for the time offset of a sensor that reads between the pictures, and by 18 % for mounts
 and lenses of two cameras that take turns on a shaking cab for a minute (the edge's common part: 2 %)."""
-STEPS = 8
-"""At most; two or three are enough at 60 epochs and at 60,000."""
+STEPS, LONGER = 8, 2.0
+"""Steps at the most, and how many times as long as the one before one may be. Two or three are enough at 60 epochs and
+at 60,000. The second is often as long as the first, all of it in the states: the statics' first step bends the pictures
+of the whole log, and they mend that."""
 NOT_FREED = (
     "lenses, mounts and sensor curves still feel the motion prior, for the steps that free them of it did not end: "
     "in a long log they may be off by more than their sigmas say"
 )
 
 
-def unpulled(problem: Problem, optimum: optimise.Optimum) -> optimise.Optimum:
-    """The optimum with the statics that the measurements tell without the motion prior, and states that follow.
+def freed(
+    problem: Problem, values: Values, weights: Weights, limit: int, log: Iterations = UNKEPT
+) -> tuple[Values, int, bool, float, float] | None:
+    """Newton's steps to the statics that the measurements tell without the motion prior, and to states that follow.
 
-    Newton's steps from the optimum of everything: they do not fall to a minimum, so no cost can judge them, but they
-    are short. Where they do not end it comes back as it was, its covariances too, with a remark.
+    They do not fall to a minimum, so no cost can judge them: they must end by getting short. None where they do not;
+    nor could the covariances be had there.
+
+    Returns
+    -------
+    values : Values
+    used : int
+        Steps taken, `limit` at the most.
+    converged : bool
+    left : float
+        Length of the next step in posterior sigmas, as far as the last two tell.
+    cost : float
+        Of everything, the motion prior too.
     """
-    if not optimum.converged or problem.statics.size == 0:
-        return optimum
-    held, values = unchecked_statics(problem), optimum.values
-    undamped, before = np.zeros(len(problem.epochs.time_ns)), optimise.STEP_SIGMAS
-    for n in range(STEPS):
-        step = optimise.Step(problem, values, optimum.weights, held, newton=True, ease=EASE)
+    held, undamped = unchecked_statics(problem), np.zeros(len(problem.epochs.time_ns))
+    used, before, left, converged = 0, np.inf, np.inf, False
+    if (kept := log.recall()) is not None:
+        values, _, used, before, left, converged, _ = kept
+    while used < limit and not converged:
+        step = Step(problem, values, weights, held, newton=True, ease=EASE)
         try:
             step.solve(undamped)
         except EstimationError:
-            break
-        if np.any(step.damping):  # nor could the covariances be had
-            break
-        values = step.taken(1.0)
-        left = optimise.left_after(step.longest, before)
-        if left < optimise.STEP_SIGMAS:
-            local, prior = cost_of(problem, values, optimum.weights)
-            return replace(
-                optimum,
-                values=values,
-                iterations=optimum.iterations + n + 1,
-                last_step_sigmas=left,
-                cost=float(local.sum() + prior),
-                eased=True,
-            )
-        before = step.longest
-    return replace(optimum, remark=NOT_FREED)
+            return None
+        if np.any(step.damping) or step.longest > LONGER * before or used == STEPS:
+            return None
+        values, used = step.taken(1.0), used + 1
+        left = left_after(step.longest, before)
+        before, converged = step.longest, left < STEP_SIGMAS
+        log.keep(values, undamped, used, before, left, converged, True)
+    local, prior = cost_of(problem, values, weights)
+    return values, used, converged, left, float(local.sum() + prior)

@@ -22,8 +22,8 @@ import scipy.linalg
 from numba import njit
 
 from pipeline.estimation import sweeps
+from pipeline.estimation.gauss_newton import HOLD
 from pipeline.estimation.linearised import parts, pieces
-from pipeline.estimation.optimise import HOLD
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem, Weights, huber, lengths, unchecked_statics
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals

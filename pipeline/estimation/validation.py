@@ -6,9 +6,9 @@ import numpy as np
 import scipy.stats
 
 from pipeline.estimation import arrow
+from pipeline.estimation.gauss_newton import HOLD
 from pipeline.estimation.marginals import Marginals
 from pipeline.estimation.normal import linearise
-from pipeline.estimation.optimise import HOLD
 from pipeline.estimation.problem import (
     Problem,
     Weights,

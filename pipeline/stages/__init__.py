@@ -144,7 +144,7 @@ STAGES = (
     Stage("detect", 6, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        15,
+        16,
         "adjusting the network",
         ("ingest", "detect"),
         (),

@@ -17,8 +17,7 @@ from pipeline.config.machine import Motion
 from pipeline.config.site import EstimationSettings
 from pipeline.estimation.adjust import problem_of_log, solution_of
 from pipeline.estimation.marginals import marginals
-from pipeline.estimation.optimise import optimise
-from pipeline.estimation.pull import unpulled
+from pipeline.estimation.optimise import optimise, unpulled
 from pipeline.geometry import linkage, se3
 from pipeline.network import Network, Observations, Readings, network_of
 from pipeline.network.datum import tie

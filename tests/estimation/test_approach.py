@@ -5,12 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.estimation import approach, sweeps
+from pipeline.estimation import approach, pull, sweeps
 from pipeline.estimation import optimise as iterations
 from pipeline.estimation.linearised import pieces
 from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import linearise
-from pipeline.estimation.optimise import optimise
+from pipeline.estimation.optimise import optimise, unpulled
 from pipeline.estimation.parts import bounds, part_of
 from pipeline.estimation.problem import keep_all
 from tests.estimation.simulator import Options, draw
@@ -94,17 +94,41 @@ def test_held_statics_leave_the_states_normal_equations_as_they_are(problem):
     np.testing.assert_allclose(g_held, g_z[clocks], rtol=1e-9)
 
 
+def _same_answer(problem, near, far):
+    sigma = np.sqrt(np.diagonal(marginals(problem, far.values, far.weights, far.eased).P_zz))
+    assert near.converged
+    assert near.cost == pytest.approx(far.cost, rel=1e-8)
+    assert np.abs((near.values.z - far.values.z) / sigma).max() < 0.01
+    for a, b in zip(near.weights.corners, far.weights.corners, strict=True):
+        assert np.array_equal(a, b) and not a.all()
+
+
 def test_a_log_that_was_approached_ends_where_it_does_from_its_start(problem, plain, short_stretches):
     near = optimise(problem, HUBER, 40)
     again = optimise(problem, HUBER, 40)
-    assert near.converged and near.iterations < plain.iterations
-    assert near.cost == pytest.approx(plain.cost, rel=1e-8)
-    sigma = np.sqrt(np.diagonal(marginals(problem, plain.values, plain.weights).P_zz))
-    assert np.abs((near.values.z - plain.values.z) / sigma).max() < 0.01
-    for a, b in zip(near.weights.corners, plain.weights.corners, strict=True):
-        assert np.array_equal(a, b) and not a.all()
+    far = unpulled(problem, plain)
+    assert near.eased and near.iterations < far.iterations
+    _same_answer(problem, near, far)
+    assert unpulled(problem, near) is near
     assert near.values.z.tobytes() == again.values.z.tobytes()
-    print(f"{near.iterations} steps of everything, {plain.iterations} from the start")
+    print(f"{near.iterations} steps of everything, {far.iterations} from the start")
+
+
+def test_a_long_log_of_other_variances_goes_on_from_its_statics(problem, plain, short_stretches):
+    """Densities a hundredth of those before: Newton's steps alone would be far off."""
+    other = replace(problem, densities=tuple(0.01 * q for q in problem.densities))
+    far = unpulled(other, optimise(other, HUBER, 60))
+    near = optimise(replace(other, first=plain.values), HUBER, 60, near=True)
+    assert near.eased
+    _same_answer(other, near, far)
+    print(f"{near.iterations} steps of everything, {far.iterations} from the start")
+
+
+def test_where_steps_without_the_pull_get_longer_the_cost_leads(problem, plain, short_stretches, monkeypatch):
+    monkeypatch.setattr(pull, "LONGER", 0.0)
+    near = optimise(problem, HUBER, 40)
+    assert not near.eased
+    _same_answer(problem, near, plain)
 
 
 def test_near_enough_ends_a_step_earlier_and_no_further_off_than_it_says(problem, plain):

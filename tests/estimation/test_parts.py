@@ -214,7 +214,7 @@ def test_states_are_moved_as_the_exponential_says():
 def test_the_optimum_has_the_same_bytes_on_one_core_and_on_two(at, parts_of, monkeypatch):
     problem, _, _ = at
     monkeypatch.setattr(parts.bounds, "__defaults__", (parts_of,))
-    monkeypatch.setattr("pipeline.estimation.optimise.KEPT_PARTS", 1)
+    monkeypatch.setattr("pipeline.estimation.gauss_newton.KEPT_PARTS", 1)
     found = []
     for cores in (1, 2, 3):
         monkeypatch.setattr(threads, "cores", lambda cores=cores: cores)

@@ -12,7 +12,7 @@ from pipeline.stages.estimate import Scratch
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from pipeline.estimation import optimise
+from pipeline.estimation import gauss_newton, optimise
 from pipeline.stages.estimate import Scratch
 from tests.estimation.simulator import Options, draw
 from tests.estimation.test_adjust import _problem
@@ -27,8 +27,8 @@ class Killed(Scratch):
             os.kill(os.getpid(), signal.SIGKILL)
 
 solved = []
-solve = optimise.Step.solve
-optimise.Step.solve = lambda self, damping: solved.append(0) or solve(self, damping)
+solve = gauss_newton.Step.solve
+gauss_newton.Step.solve = lambda self, damping: solved.append(0) or solve(self, damping)
 problem = _problem(draw(3, Options(9, outliers=0.1)))
 found = optimise.optimise(problem, 2.5, 60, False, Killed(Path(sys.argv[1]), "of this", 0.0), "first")
 poses = b"".join(T.tobytes() for T in found.values.pose)
