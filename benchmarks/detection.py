@@ -42,6 +42,7 @@ RATIO_BARS = {3: 2.0, 9: 3.0}
 START_NS = 1_700_000_000_000_000_000
 CAMERAS = ("left", "right")
 SAME_PX = 1.0
+FURTHEST = 5.0
 SHIFT_FRAMES = 8 * 3600 * 2 * 10
 PASSES = 10
 SLOPE_BAR = 1.0
@@ -80,6 +81,12 @@ class Recall:
     full_rms_px: float
     wrong: int
     """Accepted more than 1 px from any such tag."""
+    normalised: float
+    """RMS of following's corner errors over their own sigma, per axis."""
+    furthest: float
+    """Largest Mahalanobis distance of a corner, in sigmas."""
+    over: int
+    """Rows with a corner beyond 5 sigmas."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +187,7 @@ def recall_of(what: Search, slices: list[Slice], tags: int, shots: Sequence[Shot
     """Rows of the kept pieces against a full search of every picture."""
     finder, refiner = TagFinder(what.families, what.settings), Refiner()
     full: list[dict[int, np.ndarray]] = []
-    errors, full_errors = [], []
+    errors, full_errors, distances_2 = [], [], []
     for shot in shots:
         grey = decode_grey(shot.jpeg, "jpeg")
         seen = search(grey, finder, refiner)
@@ -194,11 +201,14 @@ def recall_of(what: Search, slices: list[Slice], tags: int, shots: Sequence[Shot
         shift = CAMERAS.index(part.camera) * PERIOD // 2
         columns = read_piece(part).columns
         uv = np.stack([columns[f"{axis}{k}"] for k in range(4) for axis in "uv"], axis=1).reshape(-1, 4, 2)
+        cov = np.stack([columns[f"cov{k}_{e}"] for k in range(4) for e in ("uu", "uv", "uv", "vv")], axis=1)
+        cov = cov.reshape(-1, 4, 2, 2)
         good = columns["status"] == ACCEPTED
         for frame in part.frame.tolist():
             index = (frame + shift) % PERIOD
             mine = np.flatnonzero(good & (columns["frame"] == frame))
             seen_here = {int(columns["tag_id"][row]): uv[row] for row in mine}
+            cov_here = {int(columns["tag_id"][row]): cov[row] for row in mine}
             frames += 1
             found += len(mine)
             rows_full += len(full[index])
@@ -209,11 +219,19 @@ def recall_of(what: Search, slices: list[Slice], tags: int, shots: Sequence[Shot
                 at = _truth(shots[index], number)
                 if at is not None and np.abs(here - at).max() < SAME_PX:
                     errors.append(here - at)
+                    whitened = np.linalg.solve(cov_here[number], (here - at)[..., None])[..., 0]
+                    distances_2.append(np.sum((here - at) * whitened, axis=-1))
                 # A tag whose rim alone is cut off has its corners in the picture, and no truth kept.
                 elif at is not None or np.all((here > 2) & (here < np.array(what.sizes[part.camera]) - 3)):
                     wrong += 1
     rms, full_rms = (float(np.sqrt(np.mean(np.square(e)))) for e in (errors, full_errors))
-    return Recall(tags, frames, rows_full, missed, found, found - rows_full, rms, full_rms, wrong)
+    distance = np.sqrt(distances_2)
+    return Recall(
+        tags, frames, rows_full, missed, found, found - rows_full, rms, full_rms, wrong,
+        normalised=float(np.sqrt(np.mean(distance**2) / 2)),
+        furthest=float(distance.max()),
+        over=int(np.sum(distance.max(axis=1) > FURTHEST)),
+    )  # fmt: skip
 
 
 def _truth(shot: Shot, number: int) -> np.ndarray | None:
@@ -328,12 +346,15 @@ def main() -> int:
                         )
             recalls.append(recall_of(what, slices, tags, shots))
             log.unlink()
-        print("tags  frames  full search  missed  followed  beyond  RMS px (full)  wrong")
+        print(
+            "tags  frames  full search  missed  followed  beyond  RMS px (full)  wrong  normalised  furthest  over 5"
+        )
         for recall in recalls:
             rows.append(recall)
             print(
                 f"{recall.tags:4d}  {recall.frames:6d}  {recall.full:11d}  {recall.missed:6d}  {recall.followed:8d}  "
-                f"{recall.beyond:6d}  {recall.rms_px:.4f} ({recall.full_rms_px:.4f})  {recall.wrong}",
+                f"{recall.beyond:6d}  {recall.rms_px:.4f} ({recall.full_rms_px:.4f})  {recall.wrong:5d}  "
+                f"{recall.normalised:10.2f}  {recall.furthest:8.1f}  {recall.over:6d}",
                 flush=True,
             )
             if recall.beyond < 0:

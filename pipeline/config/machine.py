@@ -194,8 +194,11 @@ class Sensor(Section):
     noise: Positive
     """Standard deviation of one raw reading, quantisation included, in the raw unit."""
     time_offset_s: float = 0.0
-    """True time of a sample minus its stamp, seconds."""
+    """True time of a sample minus its stamp, seconds, where the log begins."""
     sigma_time_offset_s: NonNegative = 0.0
+    clock_drift_ppm: float = 0.0
+    """How much the time offset grows over the log: microseconds a second; 1 is 3.6 ms an hour."""
+    sigma_clock_drift_ppm: NonNegative = 0.0
 
     @model_validator(mode="after")
     def _linkage_goes_with_length(self) -> Sensor:

@@ -110,7 +110,7 @@ def problem_of_log(network: Network, tied, epochs: Epochs, repeated: Repeated = 
     """The least-squares problem of a log, with its start."""
     first = start_values(network, tied, epochs)
     statics = statics_of(network, tied, first)
-    values = Values(first.pose, first.rate, np.zeros(statics.size))
+    values = Values(first.pose, first.rate, np.zeros(statics.size), epochs.time_s)
     return problem_of(network, tied, epochs, statics, values, repeated)
 
 

@@ -82,7 +82,12 @@ def of_stretches(problem: Problem, weights: Weights, epochs) -> tuple[Problem, W
 
 def at_epochs(values: Values, epochs) -> Values:
     """The states of some epochs, with all statics."""
-    return Values(tuple(T[epochs] for T in values.pose), tuple(w[epochs] for w in values.rate), values.z)
+    return replace(
+        values,
+        pose=tuple(T[epochs] for T in values.pose),
+        rate=tuple(w[epochs] for w in values.rate),
+        time_s=values.time_s[epochs],
+    )
 
 
 def _rows(groups, alive, epochs, E: int):

@@ -53,6 +53,7 @@ def arrays_of(values: Values) -> Arrays:
         **{f"pose {k}": T for k, T in enumerate(values.pose)},
         **{f"rate {k}": w for k, w in enumerate(values.rate)},
         "z": values.z,
+        "time_s": values.time_s,
     }
 
 
@@ -63,6 +64,7 @@ def values_of(arrays: Arrays) -> Values:
         tuple(arrays[f"pose {k}"] for k in range(count)),
         tuple(arrays[f"rate {k}"] for k in range(count)),
         arrays["z"],
+        arrays["time_s"],
     )
 
 

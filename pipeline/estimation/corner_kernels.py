@@ -114,8 +114,8 @@ def add_corners(
     width,
     K,
     clock,
+    clock_width,
     K_clock,
-    rate,
     intrinsics,
     intrinsics_column,
     K_intrinsics,
@@ -154,12 +154,10 @@ def add_corners(
         First of the group's columns that the edge's error moves with, and how many.
     K : (m, 6, w) array
         The edge's right perturbation by those columns.
-    clock : (m,) int array
-        The group's column of the clock of a joint, or -1.
-    K_clock : (m,) array
-        Turn by that column, per rate.
-    rate : (m, n or 1) array
-        Of the joint, rad/s.
+    clock, clock_width : (m,) int arrays
+        First of the group's columns of the clock of a joint, or -1 where it is exact, and how many.
+    K_clock : (m, n or 1, 1 + w) array
+        A joint's turn by its rate, for it is seen late, and by those columns; the former in the column after its own.
     intrinsics : (9,) array
         In the order of ``camera.INTRINSICS``.
     intrinsics_column : int
@@ -265,7 +263,10 @@ def add_corners(
                                 j3 * K[s, 3, j] + j4 * K[s, 4, j] + j5 * K[s, 5, j]
                             )
                     if clock[s] >= 0:
-                        a[e, clock[s]] += J[e, 5] * K_clock[s] * rate[s, i if rate.shape[1] > 1 else 0]
+                        by_clock = K_clock[s, i if K_clock.shape[1] > 1 else 0]
+                        a[e, at + 1] += J[e, 5] * by_clock[0]
+                        for j in range(clock_width[s]):
+                            a[e, clock[s] + j] += J[e, 5] * by_clock[1 + j]
             if wi > 0:
                 xd = x * radial + 2 * c6 * x * y + c7 * (r2 + 2 * x * x)
                 yd = y * radial + c6 * (r2 + 2 * y * y) + 2 * c7 * x * y

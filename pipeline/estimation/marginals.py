@@ -136,13 +136,14 @@ def body_track(problem: Problem, values: Values, found: Marginals, frame: str, n
         if step.edge.kind == "joint":
             J_turn = step.edge.ratio * J[:, :, 5]
             J_x[:, :, at.start] += J_turn
-            J_x[:, :, at.start + 1] -= J_turn * problem.statics.clock_error(index, values.z)
+            late = problem.statics.clock_error(index, values.z, values.time_s)
+            J_x[:, :, at.start + 1] -= J_turn * np.broadcast_to(late, E)[:, None]
             turning = J_turn * values.rate[index][:, None]
             velocity += turning
             clock = problem.statics.clocks[index]
             if clock is not None:
-                sensitivity = problem.statics.sensitivity(clock, values.z)
-                M[:, :, problem.statics.columns[clock]] -= turning[..., None] @ sensitivity
+                by_clock = problem.statics.lateness_by(clock, values.z, values.time_s)
+                M[:, :, problem.statics.columns[clock]] -= turning[..., None] * by_clock[:, None]
         else:
             J_x[:, :, at.start : at.start + 6] += J
             velocity += np.einsum("nij,nj->ni", J, values.rate[index])

@@ -214,8 +214,10 @@ def _add_corners(
     statics, z = problem.statics, values.z
     x_at: list[int] = []
     z_at: list[int] = []
-    # Per step: state columns, static columns, the edge's error by each, and a joint's clock.
-    steps: list[tuple[list[int], list[int], np.ndarray, tuple[int, float] | None]] = []
+    # Per step: state columns, static columns, the edge's error by each, and a joint's clock: its columns, and the turn
+    # by the joint's rate and by them, (n, 1 + r).
+    steps: list[tuple[list[int], list[int], np.ndarray, tuple[list[int], np.ndarray] | None]] = []
+    time_s = values.time_s[group.epoch]
     for step in group.path:
         index, kind = step.edge.index, step.edge.kind
         if kind == "static":
@@ -226,16 +228,18 @@ def _add_corners(
             places = [at + i for i in range(6 if kind == "moving" else 2)]
             x_at += [x for x in places if x not in x_at]
             turn = np.zeros((6, 2))
-            clock: tuple[int, float] | None = None
+            clock: tuple[list[int], np.ndarray] | None = None
             if kind == "joint":
-                turn[TURN_COLUMN] = step.edge.ratio * np.array([1.0, -statics.clock_error(index, z)])
+                turn[TURN_COLUMN, 0] = step.edge.ratio
                 of = statics.clocks[index]
-                if of is not None and len(statics.columns[of]):
+                if of is not None and len(statics.columns[of]):  # else it is not late
+                    rate, late = values.rate[index][group.epoch], statics.lateness(of, z, time_s)
+                    by_clock = rate[:, None] * statics.lateness_by(of, z, time_s)
                     clock = (
-                        int(statics.columns[of][0]),
-                        -step.edge.ratio * float(statics.sensitivity(of, z)[0, 0]),
+                        statics.columns[of].tolist(),
+                        -step.edge.ratio * np.column_stack([late, by_clock]),
                     )
-                    z_at += [clock[0]] if clock[0] not in z_at else []
+                    z_at += [c for c in clock[0] if c not in z_at]
             steps.append((places, [], np.eye(6) if kind == "moving" else turn, clock))
     intrinsics = statics.columns[group.intrinsics]
     z_at += [c for c in intrinsics if c not in z_at]
@@ -245,16 +249,17 @@ def _add_corners(
     m, cx = len(steps), len(x_at)
     column, width = np.zeros(m, dtype=np.int64), np.zeros(m, dtype=np.int64)
     K = np.zeros((m, 6, max([s[2].shape[1] for s in steps] + [1])))
-    clocks, K_clock = np.full(m, -1, dtype=np.int64), np.zeros(m)
-    rate = np.zeros((m, len(group.epoch) if any(s[3] for s in steps) else 1))
+    clocks, clock_width = np.full(m, -1, dtype=np.int64), np.zeros(m, dtype=np.int64)
+    widest = max((s[3][1].shape[1] for s in steps if s[3] is not None), default=0)
+    K_clock = np.zeros((m, len(group.epoch) if widest else 1, max(widest, 1)))
     for n, (x, z_columns, J, turned) in enumerate(steps):
         width[n] = len(x) + len(z_columns)
         if width[n]:
             column[n] = x_at.index(x[0]) if x else cx + z_at.index(z_columns[0])
             K[n, :, : width[n]] = J
         if turned is not None:
-            clocks[n], K_clock[n] = cx + z_at.index(turned[0]), turned[1]
-            rate[n] = values.rate[group.path[n].edge.index][group.epoch]
+            clocks[n], clock_width[n] = cx + z_at.index(turned[0][0]), len(turned[0])
+            K_clock[n, :, : 1 + clock_width[n]] = turned[1]
     moving = [s.edge.index for s in group.path if s.edge.kind != "static"]
     if moving:
         chain = chains[problem.place(moving[0])[0]]
@@ -278,8 +283,8 @@ def _add_corners(
         width,
         K,
         clocks,
+        clock_width,
         K_clock,
-        rate,
         statics.value(group.intrinsics, z),
         cx + z_at.index(intrinsics[0]) if len(intrinsics) else 0,
         np.ascontiguousarray(statics.sensitivity(group.intrinsics, z)),  # else it is compiled twice

@@ -14,10 +14,10 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 
 from pipeline.estimation import arrow
+from pipeline.estimation.approach import at_epochs
 from pipeline.estimation.normal import linearise
 from pipeline.estimation.problem import Problem, keep_all
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
-from pipeline.estimation.values import Values
 from pipeline.network import frames as fr
 from pipeline.network.model import SOURCES
 
@@ -257,7 +257,6 @@ def _cut(problem: Problem, keep) -> Problem:
         kept = {k: v[rows] for k, v in parts.items() if isinstance(v, np.ndarray) and len(v) == n}
         return replace(group, **(kept | {"epoch": new[group.epoch[rows]]}))
 
-    first = problem.first
     epochs = replace(problem.epochs, time_ns=problem.epochs.time_ns[keep])
     between = keep[:-1]
     return replace(
@@ -265,7 +264,7 @@ def _cut(problem: Problem, keep) -> Problem:
         epochs=epochs,
         corners=tuple(c for c in map(rows_of, problem.corners) if len(c.epoch)),
         sensors=tuple(s for s in map(rows_of, problem.sensors) if len(s.epoch)),
-        first=Values(tuple(p[keep] for p in first.pose), tuple(r[keep] for r in first.rate), first.z),
+        first=at_epochs(problem.first, keep),
         dt_s=np.diff(epochs.time_s),
         densities=tuple(q[between] for q in problem.densities),
     )

@@ -93,7 +93,12 @@ def _rows(groups, alive, start: int, stop: int):
 
 def cut(values: Values, span: slice) -> Values:
     """The states of some epochs, with all statics."""
-    return replace(values, pose=tuple(T[span] for T in values.pose), rate=tuple(w[span] for w in values.rate))
+    return replace(
+        values,
+        pose=tuple(T[span] for T in values.pose),
+        rate=tuple(w[span] for w in values.rate),
+        time_s=values.time_s[span],
+    )
 
 
 def joined(values: list[Values]) -> Values:
@@ -102,4 +107,5 @@ def joined(values: list[Values]) -> Values:
         values[0],
         pose=tuple(np.concatenate(T) for T in zip(*(v.pose for v in values), strict=True)),
         rate=tuple(np.concatenate(w) for w in zip(*(v.rate for v in values), strict=True)),
+        time_s=np.concatenate([v.time_s for v in values]),
     )

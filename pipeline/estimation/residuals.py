@@ -98,12 +98,14 @@ def corner_residuals(corners: Corners, values: Values, statics: Statics, jacobia
         if step.edge.kind == "joint":
             J_turn = -np.cross(J_rho, p_child[:, :, None, :])[..., TURN_COLUMN - 3].reshape(n, 8)
             J_turn = step.edge.ratio * J_turn
-            J = J_turn[..., None] * np.array([1.0, -statics.clock_error(index, values.z)])
+            time_s = values.time_s[corners.epoch]
+            by_rate = np.broadcast_to(-statics.clock_error(index, values.z, time_s), n)[:, None] * J_turn
+            J = np.stack([J_turn, by_rate], axis=-1)
             by_variable[index] = by_variable.get(index, 0.0) + J  # a belt may bring one angle in twice
             clock = statics.clocks[index]
             if clock is not None and len(statics.columns[clock]):
                 J_clock = -J_turn * values.rate[index][corners.epoch][:, None]
-                J = J_clock[..., None] @ statics.sensitivity(clock, values.z)
+                J = J_clock[..., None] * statics.lateness_by(clock, values.z, time_s)[:, None]
                 by_static[clock] = by_static.get(clock, 0.0) + J
             continue
         J = np.concatenate([J_rho, -np.cross(J_rho, p_child[:, :, None, :])], axis=-1)
@@ -164,10 +166,10 @@ def sensor_residuals(readings: SensorReadings, values: Values, statics: Statics,
     """
     sensor, k = readings.sensor, readings.variable
     own_clock = statics.clocks[k] == sensor.offset
-    dt = readings.dt_s
+    dt, time_s = readings.dt_s, values.time_s[readings.epoch]
     if not own_clock:
-        late = statics.value(sensor.offset, values.z)[0] - statics.base[sensor.offset][0]
-        dt = dt + late - statics.clock_error(k, values.z)
+        late = statics.lateness(sensor.offset, values.z, time_s)
+        dt = dt + late - statics.clock_error(k, values.z, time_s)
     rate = values.rate[k][readings.epoch]
     angle = values.pose[k][readings.epoch] + rate * dt
     curve = statics.value(sensor.curve, values.z)
@@ -199,10 +201,10 @@ def sensor_residuals(readings: SensorReadings, values: Values, statics: Statics,
     }
     if not own_clock:
         J_late = (-J_measured_angle * rate)[:, None, None] * scale
-        by_static[sensor.offset] = J_late @ statics.sensitivity(sensor.offset, values.z)
+        by_static[sensor.offset] = J_late * statics.lateness_by(sensor.offset, values.z, time_s)[:, None]
         clock = statics.clocks[k]
         if clock is not None:
-            by_static[clock] = -J_late @ statics.sensitivity(clock, values.z)
+            by_static[clock] = -J_late * statics.lateness_by(clock, values.z, time_s)[:, None]
     if sensor.linkage is not None:
         assert J_length_params is not None
         by_static[sensor.linkage] = (

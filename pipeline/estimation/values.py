@@ -56,10 +56,24 @@ class Statics:
             self.base[index] if len(self.columns[index]) == 0 else se3.retract(self.base[index], correction)
         )
 
-    def clock_error(self, variable: int, z) -> float:
-        """How much later the states of a joint are, in truth, than their epochs say, seconds."""
+    def clock_error(self, variable: int, z, time_s):
+        """How much later the states of a joint are, in truth, than their epochs say, seconds: (n,), or 0."""
         clock = self.clocks[variable]
-        return 0.0 if clock is None else float((self.scale[clock] @ z[self.columns[clock]])[0])
+        return 0.0 if clock is None else self.lateness(clock, z, time_s)
+
+    def lateness(self, offset: int, z, time_s):
+        """(n,) what the file's time offset of a sensor lacks at these times of the log, seconds."""
+        return self._of_clock(offset, time_s) @ (self.scale[offset] @ z[self.columns[offset]])
+
+    def lateness_by(self, offset: int, z, time_s):
+        """(n, r) the same by the offset's unknowns."""
+        return self._of_clock(offset, time_s) @ self.sensitivity(offset, z)
+
+    def _of_clock(self, offset: int, time_s):
+        """(n, 1 or 2) seconds late by the offset, s, and its drift, ppm."""
+        basis = np.ones((len(time_s), len(self.base[offset])))
+        basis[:, 1:] = 1e-6 * time_s[:, None]
+        return basis
 
     def sensitivity(self, index: int, z):
         """(n, r): change of the value, or right perturbation of the pose, by its unknowns; not to be written to."""
@@ -83,8 +97,8 @@ class Along(Statics):
     def value(self, index: int, z):
         return self.of.value(index, self.z)
 
-    def clock_error(self, variable: int, z) -> float:
-        return self.of.clock_error(variable, self.z)
+    def lateness(self, offset: int, z, time_s):
+        return self.of.lateness(offset, self.z, time_s)
 
     def _sensitivity(self, index: int, z):
         scale = self.scale[index]
@@ -136,6 +150,8 @@ class Values:
     """Per variable: (E, 6) or (E,)."""
     z: np.ndarray
     """(p,) whitened corrections of the statics."""
+    time_s: np.ndarray
+    """(E,) seconds of each epoch since the log's first."""
 
     def retract(self, deltas, dz) -> Values:
         """Moved by a step: per variable (E, 12) or (E, 2), and (p,)."""
@@ -157,5 +173,6 @@ class Values:
         value = self.pose[edge.index][epoch]
         if edge.kind == "moving":
             return value
-        angle = value - self.rate[edge.index][epoch] * statics.clock_error(edge.index, self.z)
+        late = statics.clock_error(edge.index, self.z, self.time_s[epoch])
+        angle = value - self.rate[edge.index][epoch] * late
         return fr.turn(edge.ratio * angle)

@@ -21,7 +21,6 @@ from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem, huber, lengths
 from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.residuals import corner_residuals
-from pipeline.estimation.values import Values
 
 ROUNDS = 4
 ROUND_STEPS = 2
@@ -119,8 +118,7 @@ def with_repeated(problem: Problem, old: Repeated, new: Repeated) -> Problem:
             scale[k] = factor * scale[k]
             z[problem.statics.columns[k]] /= factor
     statics = replace(problem.statics, scale=tuple(scale))
-    first = Values(problem.first.pose, problem.first.rate, z)
-    return replace(problem, corners=corners, statics=statics, first=first)
+    return replace(problem, corners=corners, statics=statics, first=replace(problem.first, z=z))
 
 
 def _near(a: Repeated, b: Repeated) -> bool:

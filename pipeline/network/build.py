@@ -131,14 +131,15 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
             names,
             tuple(f"{unit}/raw^{i}" if i else unit for i in range(len(names))),
         )
+        drifts = sensor.clock_drift_ppm != 0 or sensor.sigma_clock_drift_ppm > 0
         offset = Static(
             f"sensor {name} time offset",
             "time offset",
             False,
-            np.array([sensor.time_offset_s]),
-            np.array([[sensor.sigma_time_offset_s**2]]),
-            ("offset",),
-            ("s",),
+            np.array([sensor.time_offset_s, sensor.clock_drift_ppm][: 1 + drifts]),
+            np.diag([sensor.sigma_time_offset_s**2, sensor.sigma_clock_drift_ppm**2][: 1 + drifts]),
+            ("offset", "drift")[: 1 + drifts],
+            ("s", "ppm")[: 1 + drifts],
         )
         bars = None if sensor.linkage is None else add(_linkage_static(name, sensor.linkage))
         side = 1 if sensor.linkage is None else sensor.linkage.branch

@@ -64,7 +64,7 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
     dropped: dict[str, int] = {}
     frames, frame_index = _clusters(observations.time_ns, FRAMES_MERGE_NS)
     stamps = frames
-    taken = {}
+    taken: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     for s, sensor in enumerate(network.sensors):
         if sensor.name not in readings:
             continue
@@ -72,6 +72,7 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
         if len(raw):
             offset_ns = round(float(network.statics[sensor.offset].value[0]) * 1e9)
             taken[s] = (time_ns + offset_ns, raw)
+    taken = _drifted(network, taken, frames)
     lonely = [t[_distance(t, stamps) > READINGS_MERGE_NS] for t, _ in taken.values()]
     if lonely:
         own, _ = _clusters(np.concatenate(lonely), READINGS_MERGE_NS)
@@ -86,6 +87,16 @@ def epochs_of(network: Network, observations: Observations, readings: dict[str, 
     if len(first) < len(frame_epoch):
         dropped["tag seen twice at one instant"] = len(frame_epoch) - len(first)
     return Epochs(stamps, observations.take(first), frame_epoch[first], sensors, dropped)
+
+
+def _drifted(network: Network, taken, frames):
+    """Readings by sensor at their nominal true time, where a clock drifts from the first epoch on."""
+    begins_ns = min([int(t[0]) for t, _ in taken.values()] + frames[:1].tolist(), default=0)
+    out = {}
+    for s, (time_ns, raw) in taken.items():
+        drift = network.statics[network.sensors[s].offset].value[1:].sum()
+        out[s] = (time_ns + np.rint(1e-6 * drift * (time_ns - begins_ns)).astype(np.int64), raw)
+    return out
 
 
 def _clean(sensor, readings: Readings, dropped: dict[str, int]):

@@ -94,7 +94,8 @@ class Sensor:
     curve: int
     linkage: int | None
     offset: int
-    """Index of the static time offset, seconds: true time of a sample minus its stamp."""
+    """Index of the static time offset, seconds: true time of a sample minus its stamp at the first epoch; and how much
+    it grows, ppm, where the file has a drift."""
     side: int
     """Which way round the linkage is built; see ``pipeline.geometry.linkage``."""
     noise: float

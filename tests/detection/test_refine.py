@@ -9,7 +9,7 @@ import numpy as np
 import pyapriltags
 import pytest
 
-from benchmarks import _light
+from benchmarks import _light, occlusion
 from benchmarks._tag_picture import View, cells, shoot
 from pipeline.detection.refine import REASONS, Refiner
 
@@ -255,6 +255,13 @@ def test_tags_under_a_bar_stand_only_where_their_corners_are_within_5_sigma():
     assert sigmas.max() < 5
     # Of those that stand, what is covered was left out.
     assert np.median([share for share, reason in zip(whole, fits.reasons) if not reason]) < 0.95
+
+
+def test_a_print_that_a_cover_took_along_is_refused():
+    """A draw of `make bench-occlusion` that was believed 7 sigmas off where straying was no reason."""
+    occlusion._begin()
+    drawn = occlusion.draw(17, 3528)
+    assert drawn.outcomes["predicted"].reason == "covered"
 
 
 BARS_EXPOSED = {1.5: (0.02, 6.0), 2.5: (0.02, 3.0), 4.0: (0.06, 1.0)}

@@ -131,6 +131,10 @@ MACHINE = {
         "bucket": {"translation": 1.0, "rotation": 3e-3},
     },
 }
+DRIFTING = copy.deepcopy(MACHINE)
+"""The same with a potentiometer whose clock drifts, far more than any does: its logs last seconds."""
+DRIFTING["sensors"]["pot"] |= {"clock_drift_ppm": 1000.0, "sigma_clock_drift_ppm": 10_000.0}
+DRIFTING["motion"]["bucket"]["rotation"] = 3e-4
 BUCKET_MARKER = {
     "family": "tag36h11",
     "tags": [{"id": 60, "size_m": 0.25, "x_m": -0.2}, {"id": 61, "size_m": 0.25, "x_m": 0.2}],
@@ -295,7 +299,9 @@ def potentiometer(rng, network: Network, by_name, reading_ns, angle) -> Readings
     assert np.all(np.isfinite(raw))
     raw = raw + network.sensors[0].noise * rng.standard_normal(len(raw))
     # The stamp is earlier than the truth by the offset; the nominal one is in the file.
-    return Readings(reading_ns - round(by_name["sensor pot time offset"][0] * 1e9), raw)
+    late_s, drift = np.append(by_name["sensor pot time offset"], 0.0)[:2]
+    since_ns = reading_ns - T0_NS
+    return Readings(reading_ns - np.rint(late_s * 1e9 + 1e-6 * drift * since_ns).astype(np.int64), raw)
 
 
 def marker_poses(network: Network, by_name, T_world, c: int, k: int, rows):

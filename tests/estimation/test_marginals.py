@@ -12,17 +12,18 @@ from pipeline.network import frames as fr
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
 from tests.estimation import dense
-from tests.estimation.simulator import Options, draw
+from tests.estimation.simulator import DRIFTING, MACHINE, Options, draw
 from tests.estimation.test_adjust import NO_LOSS, _moved
 
 
-@pytest.fixture(scope="module", params=["potentiometer", "bucket marker", "both"])
+@pytest.fixture(scope="module", params=["potentiometer", "bucket marker", "both", "drift"])
 def solved(request):
     """A small network at its optimum: problem, values, our marginals, and the dense parts."""
     options = Options(
         epochs=3,
         bucket_marker=request.param != "potentiometer",
         potentiometer=request.param != "bucket marker",
+        machine=DRIFTING if request.param == "drift" else MACHINE,
     )
     drawn = draw(3, options)
     tied = tie(drawn.network, drawn.observations, drawn.readings)

@@ -22,13 +22,13 @@ from pipeline.estimation.problem import (
 from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.geometry import se3
 from tests.estimation import dense
-from tests.estimation.simulator import Options, draw
+from tests.estimation.simulator import DRIFTING, MACHINE, Options, draw
 from tests.estimation.test_adjust import _problem
 
 HUBER = 2.5
 
 
-@pytest.fixture(scope="module", params=["potentiometer", "bucket marker", "both"])
+@pytest.fixture(scope="module", params=["potentiometer", "bucket marker", "both", "drift"])
 def at(request):
     """A log with gross corners, away from its optimum, with some corners and readings left out."""
     options = Options(
@@ -36,6 +36,7 @@ def at(request):
         bucket_marker=request.param != "potentiometer",
         potentiometer=request.param != "bucket marker",
         outliers=0.1,
+        machine=DRIFTING if request.param == "drift" else MACHINE,
     )
     problem = _problem(draw(3, options))
     rng = np.random.default_rng(4)

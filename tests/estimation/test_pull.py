@@ -16,7 +16,6 @@ from pipeline.estimation.marginals import marginals
 from pipeline.estimation.normal import linearise, linearise_twice
 from pipeline.estimation.optimise import optimise, unpulled
 from pipeline.estimation.problem import keep_all
-from pipeline.estimation.values import Values
 from pipeline.geometry import camera as camera_model
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
@@ -102,7 +101,7 @@ def _reprojected(problem, values):
 def test_statics_stay_where_exact_corners_put_them_however_stiff_the_motion_prior_is(log):
     """A prior a thousandth as loose pulls by sigmas; nothing measured is off, and the files are right."""
     problem, z = log
-    at = Values(problem.first.pose, problem.first.rate, np.zeros(problem.statics.size))
+    at = replace(problem.first, z=np.zeros(problem.statics.size))
     smooth, _ = _states(problem, z)
     at = replace(smooth, z=at.z)
     stiff = replace(

@@ -13,7 +13,7 @@ from pipeline.estimation.residuals import corner_residuals, sensor_residuals
 from pipeline.network import Readings
 from pipeline.network.datum import tie
 from pipeline.network.epochs import epochs_of
-from tests.estimation.simulator import MACHINE, Options, draw
+from tests.estimation.simulator import DRIFTING, Options, draw
 from tests.estimation.test_adjust import _problem
 
 
@@ -21,13 +21,14 @@ def _document():
     """A potentiometer and an angle sensor on the same joint, a marker on the bucket, and a site camera."""
     import copy
 
-    document = copy.deepcopy(MACHINE)
+    document = copy.deepcopy(DRIFTING)
     document["sensors"]["angle"] = {
         "topic": "/angle",
         "joint": "bucket",
         "curve": {"output": "angle_deg", "coefficients": [1.0, 0.9], "sigma": [0.5, 0.01]},
         "noise": 0.2,
         "sigma_time_offset_s": 0.002,
+        "sigma_clock_drift_ppm": 3000.0,
     }
     document["cameras"]["site"] = copy.deepcopy(document["cameras"]["dig"])
     document["cameras"]["site"] |= {
