@@ -12,6 +12,7 @@ import math
 import numba
 import numpy as np
 
+from pipeline.detection.gauss_newton import BY_CELL, PLAIN, VEILED
 from pipeline.detection.image_model import (
     AT_END,
     BLUR,
@@ -21,6 +22,7 @@ from pipeline.detection.image_model import (
     PIXEL_VARIANCE,
     PLACE,
     RESPONSE,
+    VEIL_TERMS,
 )
 from pipeline.detection.integrity import (
     contradicted,
@@ -32,6 +34,7 @@ from pipeline.detection.integrity import (
 )
 from pipeline.detection.settling import approach, by_parts, settle
 from pipeline.detection.straightening import bent_back, ideal_of
+from pipeline.detection.veil import bent_light
 
 STANDS, NO_CONTRAST, MISFIT, COVERED, TOO_SMALL, CUT, OVER_EXPOSED, UNDER_EXPOSED, BLURRED = range(9)
 
@@ -145,7 +148,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
         return
     at_border = window[0] == 0 or window[1] == 0 or window[2] == width or window[3] == height
 
-    par = np.zeros(PARAMETERS)
+    par = np.zeros(PARAMETERS + VEIL_TERMS)
     par[BLUR] = prior[0] ** 2 + PIXEL_VARIANCE
     par[RESPONSE] = prior[3]
     black, white = _first_light(grey, cells, n, lens, bent, H)
@@ -186,7 +189,11 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
                 grey, cells, n, masked, H, par, prior, place, strides, room_for, room_for_parts
             )
         else:
-            H, m, A, share = settle(grey, cells, n, masked, H, par, prior, place, strides, room_for, False)
+            H, m, A, share = settle(grey, cells, n, masked, H, par, prior, place, strides, room_for, PLAIN)
+            if m > 0 and bent_light(J, r, m, noise_on_edges(r, who, m)[0]):
+                H, m, A, share = settle(
+                    grey, cells, n, masked, H, par, prior, place, strides, room_for, VEILED
+                )
     while m > 0:
         unlike = unevenness(r, who, m, n, par, masked)
         misfit = _misfit(J, r, who, m, par)
@@ -204,7 +211,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
         # A shadow's edge across the print is no noise: each cell gets a brightness of its own.
         uneven, levels = True, cells.copy()
         masked[:] = False
-        H, m, A, share = settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, True)
+        H, m, A, share = settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, BY_CELL)
     if m == 0 or strayed:
         reason = CUT if m == 0 and at_border else COVERED
 

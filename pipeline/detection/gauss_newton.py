@@ -15,12 +15,16 @@ from pipeline.detection.image_model import (
     PIXEL_VARIANCE,
     PLACE,
     RESPONSE,
+    VEIL_TERMS,
     linearise,
 )
 from pipeline.detection.integrity import noise_on_edges, point
+from pipeline.detection.veil import eliminate_veil
 
 COARSE_STEP_PX = 0.6
 """A step this short ends the steps on a part of the pixels."""
+PLAIN, BY_CELL, VEILED = range(3)
+"""Light: as the model has it; each cell with a brightness of its own; with a veil over the print."""
 ROWS = 384
 LEAST_PIXELS, LEAST_ON_EDGES = 40, 30
 """Fewer determine no print."""
@@ -29,12 +33,12 @@ LEAST_VARIANCE = 0.06
 
 
 @numba.njit(cache=True, error_model="numpy")
-def step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for):
+def step(grey, levels, n, masked, H, par, prior, place, stride, flat, light, room_for):
     """One step from `H` and `par`, which is changed, on one in `stride` pixels near edges and in `flat` of the rest.
 
     Returns the homography after it, the pixels used (0 if they are too few; nothing is changed then), the normal
-    matrix with its priors, the step as it was taken and how far it moved a corner, px. `room_for` holds derivatives,
-    residuals and owners of the pixels before the step.
+    matrix with its priors, the step as it was taken, the veil's after the parameters', and how far it moved a corner,
+    px. `room_for` holds derivatives, residuals and owners of the pixels before the step.
     """
     lens, bent, norm, window, quiet, lo, hi, cell_px = place
     J, r, who = room_for
@@ -44,13 +48,19 @@ def step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, ro
     )  # fmt: skip
     sigma, edge = noise_on_edges(r, who, m)
     if m < LEAST_PIXELS or edge < LEAST_ON_EDGES:
-        return H, 0, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS), 0.0
+        return H, 0, np.zeros((PARAMETERS, PARAMETERS)), np.zeros(PARAMETERS + VEIL_TERMS), 0.0
     A, b = _normal_equations(J, r, m)
-    if uneven:
+    x = np.zeros(PARAMETERS + VEIL_TERMS)
+    K = np.zeros((VEIL_TERMS, PARAMETERS))
+    if light == VEILED:
+        K, x[PARAMETERS:] = eliminate_veil(A, b, J, r, m, par, sigma)
+    if light == BY_CELL:
         # The cells' own brightness and the light over all of them say the same: the light stays.
         for k in range(PLACE):
             A[k, k] += 1e9 * (1.0 + A[k, k])
-    x = _solve(A, b, par, prior, sigma)
+    of_print = _solve(A, b, par, prior, sigma)
+    x[:PARAMETERS] = of_print
+    x[PARAMETERS:] -= K @ of_print
     step_px = _furthest(H, lo, hi, norm, x)
     # A step that moves a corner further than a third of a cell left the valley: shorten it.
     part = min(1.0, max(0.35 * cell_px, 0.5) / max(step_px, 1e-12))
@@ -135,7 +145,7 @@ def _moved(H, norm, x):
 @numba.njit(cache=True, error_model="numpy")
 def _change(par, x, cell_px):
     """Light, blur and response after a step, within what there can be."""
-    for i in range(PARAMETERS):
+    for i in range(len(x)):
         if i < PLACE or i >= BLUR:
             par[i] += x[i]
     par[BLUR] = min(max(par[BLUR], LEAST_VARIANCE), max(5.0, 0.5 * cell_px * cell_px))

@@ -12,10 +12,11 @@ contrast is left out at a cell's corner, 0.004 where four cells meet as on a che
 degrees had twice the error. The derivatives are cut earlier, and take the blur along where the print is stretched:
 they are up to 11 % off in the place and 23 % in the blur then, which costs a step and moves no corner.
 
-    grey = o + o_x x + o_y y + (g + g_x x + g_y y) R(T),     R(T) = T + q T (1 - T)
+    grey = o + o_x x + o_y y + v(x, y) + (g + g_x x + g_y y) R(T),     R(T) = T + q T (1 - T)
 
-with the light o, g and its slopes over the tag, and q for the camera's response: blur happens in light, a camera
-records its square root or so, and a blurred edge then lies a third of a pixel away from where its middle grey is.
+with the light o, g and its slopes over the tag, a veil v of what is bent (mostly none, see `veil`), and q for the
+camera's response: blur happens in light, a camera records its square root or so, and a blurred edge then lies a third
+of a pixel away from where its middle grey is.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ PIXEL_VARIANCE = 1.0 / 12.0
 # the homography, the blur (mean variance, and what it has more along x than along y and along one diagonal; px²), the
 # response q, and what the ground beyond the print's left, right, upper and lower end is brighter than white.
 OFFSET, GAIN, PLACE, BLUR, RESPONSE, GROUND, PARAMETERS = 0, 1, 6, 14, 17, 18, 22
+VEIL_TERMS = 12
+"""Powers of x and y of the second to fourth order; they stand after the parameters."""
 
 REACH = 3.3
 """Sigmas beyond which an edge is not felt: 0.0005 of the contrast."""
@@ -91,6 +94,25 @@ def _beyond(a):
     f = (min(a, REACH) - _FIRST) * 256.0
     j = int(f)
     return _CDF[j] + (f - j) * (_CDF[j + 1] - _CDF[j])
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def veil_terms(x, y, terms):
+    """Powers of a place in the window, filled in."""
+    xx, xy, yy = x * x, x * y, y * y
+    terms[0], terms[1], terms[2] = xx, xy, yy
+    terms[3], terms[4], terms[5], terms[6] = xx * x, xx * y, yy * x, yy * y
+    terms[7], terms[8], terms[9], terms[10], terms[11] = xx * xx, xx * xy, xx * yy, xy * yy, yy * yy
+
+
+@numba.njit(cache=True, inline="always", error_model="numpy")
+def veil(par, x, y, terms):
+    """Grey values that the veil adds at a place in the window."""
+    veil_terms(x, y, terms)
+    total = 0.0
+    for i in range(VEIL_TERMS):
+        total += par[PARAMETERS + i] * terms[i]
+    return total
 
 
 @numba.njit(cache=True, inline="always", fastmath=True, error_model="numpy")
@@ -180,8 +202,9 @@ def linearise(
         Undistorted pixel -> print, cells.
     norm : (3,) float64 array
         Centre and half size of the window, px.
-    par : (PARAMETERS,) float64 array
-        By the places above; slopes per half size, the blur with the pixel's own, the homography's eight unused.
+    par : (PARAMETERS + VEIL_TERMS,) float64 array
+        By the places above; slopes per half size, the blur with the pixel's own, the homography's eight unused; after
+        them the veil.
     window : (4,) int array
         x0, y0, x1, y1.
     stride, flat_stride : int
@@ -208,7 +231,8 @@ def linearise(
     vxx, vyy, vxy = par[BLUR] + par[BLUR + 1], par[BLUR] - par[BLUR + 1], par[BLUR + 2]
     row_x, row_y = np.empty(5), np.empty(5)
     q = par[RESPONSE]
-    ground = np.zeros(4)
+    ground, terms = np.zeros(4), np.empty(VEIL_TERMS)
+    veiled = np.any(par[PARAMETERS:] != 0.0)
     room = len(r)
     scale = norm[2]
     reach_s, reach_t = _furthest_reach(G, n, vxx, vyy, vxy)
@@ -298,6 +322,8 @@ def linearise(
             bright = T + q * T * (1.0 - T)
             gain = par[GAIN] + par[4] * xm + par[5] * ym
             model = par[OFFSET] + par[2] * xm + par[3] * ym + gain * bright
+            if veiled:
+                model += veil(par, xm, ym, terms)
             # Beyond the print the ground shines in through the blur.
             ground[0] = _beyond(-s / sigma_s)
             ground[1] = _beyond((s - n) / sigma_s)

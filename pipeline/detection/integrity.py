@@ -7,7 +7,7 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.image_model import AT_END, GAIN, OFFSET, ON_EDGE, brightness
+from pipeline.detection.image_model import AT_END, GAIN, OFFSET, ON_EDGE, VEIL_TERMS, brightness, veil
 from pipeline.detection.straightening import bent_back
 
 
@@ -151,7 +151,7 @@ def level(r, who, m, n, par, masked, levels):
 def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
     """Cells, masked or not, whose middle is not as bright as it should be: of all, and of those that carry the id."""
     height, width = grey.shape
-    G, scratch = np.linalg.inv(H), np.empty((5, 26))
+    G, scratch, terms = np.linalg.inv(H), np.empty((5, 26)), np.empty(VEIL_TERMS)
     every, within = 0, 0
     for j in range(n):
         for i in range(n):
@@ -168,6 +168,7 @@ def contradicted(grey, cells, levels, n, lens, bent, H, norm, par):
             )
             u, v = (X - norm[0]) / norm[2], (Y - norm[1]) / norm[2]
             dark, gain = par[OFFSET] + par[2] * u + par[3] * v, par[GAIN] + par[4] * u + par[5] * v
+            dark += veil(par, u, v, terms)
             # Blur only draws a cell towards its neighbours: most need not be blurred to know.
             level = min(max(levels[j, i], 0.0), 1.0)
             if levels[j, i] == cells[j, i] and abs(seen - min(dark + gain * level, 255.0)) < 0.1 * par[GAIN]:

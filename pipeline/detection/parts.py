@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from pipeline.detection.gauss_newton import COARSE_STEP_PX, step
+from pipeline.detection.gauss_newton import COARSE_STEP_PX, PLAIN, step
 from pipeline.detection.image_model import GAIN, linearise
 from pipeline.detection.integrity import mask, rms_of_cells
 
@@ -45,7 +45,7 @@ def best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for):
             held = _held_out(part, n, masked.shape[0])
             for _ in range(2):
                 trial_H, used, _, _, step_px = step(
-                    grey, cells, n, held, trial_H, trial_par, prior, place, coarse, flat, False, room_for
+                    grey, cells, n, held, trial_H, trial_par, prior, place, coarse, flat, PLAIN, room_for
                 )
                 if used == 0 or step_px < COARSE_STEP_PX:
                     break

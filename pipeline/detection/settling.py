@@ -9,10 +9,11 @@ import math
 
 import numba
 
-from pipeline.detection.gauss_newton import COARSE_STEP_PX, step
+from pipeline.detection.gauss_newton import BY_CELL, COARSE_STEP_PX, PLAIN, VEILED, step
 from pipeline.detection.image_model import BLUR, GAIN, PARAMETERS
 from pipeline.detection.integrity import level, mask, noise_on_edges, point
 from pipeline.detection.parts import best_part
+from pipeline.detection.veil import without_veil
 
 QUIET = 0.02
 """Noise over contrast for which a limit of pixels is meant; noisier tags get more of them, by its square."""
@@ -42,7 +43,7 @@ def approach(grey, cells, n, masked, H, par, prior, place, strides, room_for):
     share, steps = 1.0, 0
     while True:
         H, m, _, sigma, step_px = _stepped(
-            grey, cells, n, masked, H, par, prior, place, coarse, flat, False, room_for
+            grey, cells, n, masked, H, par, prior, place, coarse, flat, PLAIN, room_for
         )
         if m == 0:
             return H, 0, share
@@ -56,7 +57,7 @@ def approach(grey, cells, n, masked, H, par, prior, place, strides, room_for):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, uneven):
+def settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, light):
     """Steps on all pixels that are asked for until they are short; marks cells in `masked`, changes `par`.
 
     With fewer pixels as long as they move: how many the noise asks for is known when they no longer do. Returns as
@@ -64,11 +65,11 @@ def settle(grey, levels, n, masked, H, par, prior, place, strides, room_for, une
     """
     _, fine, flat = strides
     _, r, who = room_for
-    share, steps, more = 1.0, 0, 1.0
+    share, steps, more, uneven = 1.0, 0, 1.0, light == BY_CELL
     while True:
         stride = max(1, math.ceil(fine / more))
         H, m, A, sigma, step_px = _stepped(
-            grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for
+            grey, levels, n, masked, H, par, prior, place, stride, flat, light, room_for
         )
         if m == 0:
             return H, 0, A, share
@@ -92,7 +93,7 @@ def by_parts(grey, cells, n, masked, H, par, prior, place, strides, room_for, ro
     """
     lo, hi = place[5], place[6]
     of_part = best_part(grey, cells, n, masked, H, par, prior, place, strides, room_for_parts)
-    H, m, A, share = settle(grey, cells, n, masked, of_part, par, prior, place, strides, room_for, False)
+    H, m, A, share = settle(grey, cells, n, masked, of_part, par, prior, place, strides, room_for, PLAIN)
     return H, m, A, share, m > 0 and _apart(of_part, H, lo, hi) > STRAYED_PX
 
 
@@ -109,16 +110,18 @@ def _apart(H, other, lo, hi):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _stepped(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for):
+def _stepped(grey, levels, n, masked, H, par, prior, place, stride, flat, light, room_for):
     """`step`, with the residuals as they are after it; their standard deviation in place of the step.
 
     How far it moved counts the width of the blur too: where that is still on its way, so is all else. Without it one of
     150 tags was left 5.5 sigmas off, its blur half-way.
     """
     blur_px = math.sqrt(par[BLUR])
-    H, m, A, x, step_px = step(grey, levels, n, masked, H, par, prior, place, stride, flat, uneven, room_for)
+    H, m, A, x, step_px = step(grey, levels, n, masked, H, par, prior, place, stride, flat, light, room_for)
     J, r, who = room_for
     for k in range(m):
         for i in range(PARAMETERS):
             r[k] -= J[k, i] * x[i]
+    if light == VEILED:
+        without_veil(J, r, m, x[PARAMETERS:])
     return H, m, A, noise_on_edges(r, who, m)[0], max(step_px, abs(math.sqrt(par[BLUR]) - blur_px))
