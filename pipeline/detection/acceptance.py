@@ -23,6 +23,9 @@ TWICE = "twice in one frame"
 POOR_RIVAL = 0.5
 """Part of a clean tag's margin under which another of the same id, with corrected bits, is a mistake."""
 
+ON_IT = 0.5
+"""Sides between the middles of two tags under which they are at one place."""
+
 KnownTags = Mapping[str, Set[int]]
 """Family -> ids that machine.toml and site.toml describe."""
 
@@ -64,6 +67,26 @@ def judge(
     return status
 
 
+def ghosts(seen: Seen, status: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """(n,) bool: rows that following took for a covered tag, and that are another tag or the same one elsewhere.
+
+    A print that was lost behind something may fit the next print of a board as a covered one does, frame after frame:
+    of 88 tags that were told as covered in the sample 70 lay on another tag that was accepted.
+    """
+    found = np.zeros(len(seen), bool)
+    good = status == ACCEPTED
+    doubtful = ~good & ~seen.decoded & (seen.reason != "")
+    for frame in np.unique(picture[doubtful]).tolist():
+        there = np.flatnonzero(good & (picture == frame))
+        if not len(there):
+            continue
+        for k in np.flatnonzero(doubtful & (picture == frame)):
+            same = (seen.tag_id[there] == seen.tag_id[k]) & (seen.family[there] == seen.family[k])
+            away = np.linalg.norm(seen.centre[there] - seen.centre[k], axis=1)
+            found[k] = bool(np.any(same | (away < ON_IT * seen.side_px[there])))
+    return found
+
+
 def hamming_limits(seen: Seen, settings: DetectionSettings) -> np.ndarray:
     """(n,) int, bits that may have been corrected in each tag: fewer than the settings say where codes are short."""
     limits = {
@@ -75,10 +98,10 @@ def hamming_limits(seen: Seen, settings: DetectionSettings) -> np.ndarray:
 def _doubled(seen: Seen, settings: DetectionSettings, picture: np.ndarray | None) -> np.ndarray:
     """Whether another tag of the same family and id is in the same picture: then neither can be told apart.
 
-    The two files never describe a tag twice, so there are no two that belong there. A poor decoding does not count:
-    it is more likely a mistake than a second print. Poor is what would be refused by itself, and also what had bits
-    corrected and not half the margin of one that had none; that one is refused and the other stays. By margin alone
-    nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
+    The two files never describe a tag twice (`config.prints`), so there are no two that belong there. A poor decoding
+    does not count: it is more likely a mistake than a second print. Poor is what would be refused by itself, and also
+    what had bits corrected and not half the margin of one that had none; that one is refused and the other stays. By
+    margin alone nothing is decided: of two real prints the one in the shade may be the one that was surveyed.
     What the refinement cannot lay the print over is no second print either, nor a place that only looks like the tag
     covered and that no search has decoded: following had taken the next print of a board for it.
     """

@@ -255,7 +255,7 @@ def align(grey, cells, n, border, lens, bent, uv, prior, most, rooms, out_uv, ou
     if clipped > CLIPPED * m:
         sigma *= math.sqrt(CLIPPED_VARIANCE)
     if reason == STANDS:
-        _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov)
+        _corners(A, H, lo, hi, norm, lens, bent, sigma, correlation, out_uv, out_cov)
         for k in range(4):
             if partly:
                 out_cov[2 * k, 2 * k] += PARTLY_PX**2
@@ -351,7 +351,7 @@ def _misfit(J, r, who, m, par):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _corners(A, H, lo, hi, norm, lens, bent, par, prior, sigma, correlation, out_uv, out_cov):
+def _corners(A, H, lo, hi, norm, lens, bent, sigma, correlation, out_uv, out_cov):
     """Corners in the picture and their covariance from the last normal matrix, priors and all."""
     d = np.sqrt(np.diag(A)) + 1e-12
     scaled = A / d / d.reshape(-1, 1)

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline import tables
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.acceptance import KnownTags, judge
+from pipeline.detection.acceptance import KnownTags, ghosts, judge
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.decode import Pictures, decode_grey
@@ -129,7 +129,9 @@ def search_slice(part: Slice, search: Search, reader: LogReader, finders: Finder
         each = [len(seen[n]) for n in mine]
         of_frame = np.repeat(np.array([pictures[n][0] for n in mine], np.int32), each)
         at_ns = np.repeat(np.array([pictures[n][1] for n in mine], np.int64), each)
-        rows.append(columns_of(tags, judge(tags, search.known, search.settings, of_frame), of_frame, at_ns))
+        status = judge(tags, search.known, search.settings, of_frame)
+        real = np.flatnonzero(~ghosts(tags, status, of_frame))
+        rows.append(columns_of(tags.of(real), status[real], of_frame[real], at_ns[real]))
     if missing := len(part.frame) - sum(outcomes.values()):
         outcomes[MISSING] = missing
     columns = tables.empty_columns("detections")
@@ -222,8 +224,13 @@ def _frames(part: Slice) -> dict[str, int]:
 
 
 def undone(slices: Sequence[Slice]) -> list[Slice]:
-    """Those slices that have no whole piece; folders for the pieces are made."""
+    """Those slices that have no whole piece; folders for the pieces are made. Raises ArtefactError."""
     waiting = [part for part in slices if not is_whole(part)]
     for part in waiting:
-        part.piece.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            part.piece.parent.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ArtefactError(
+                f"{part.piece.parent} cannot be made: {error.strerror or error}; make room or give another --runs"
+            ) from error
     return waiting

@@ -29,6 +29,8 @@ class Tally:
         """Tags by status."""
         self.how: Counter[str] = Counter()
         """Accepted tags by how they were found."""
+        self.accepted: set[Tag] = set()
+        """Tags that were accepted at all."""
         self.unknown: Counter[Tag] = Counter()
         """Well decoded tags that nothing describes."""
         self.stillness = Stillness()
@@ -41,6 +43,8 @@ class Tally:
         self.status.update(status.tolist())
         if "how" in columns:
             self.how.update(columns["how"][status == ACCEPTED].tolist())
+        used = status == ACCEPTED
+        self.accepted.update(zip(columns["family"][used].tolist(), columns["tag_id"][used].tolist()))
         sure = (columns["hamming"] == 0) & (columns["margin"] >= self._settings.min_margin)
         good = (status == UNKNOWN_ID) & sure
         self.unknown.update(zip(columns["family"][good].tolist(), columns["tag_id"][good].tolist()))

@@ -30,7 +30,7 @@ from pipeline.logs.reader import LogReader, read_log
 
 SLICES_PER_PROCESS = 40
 LOST_SLICES = 3
-"""Slices given up one after the other, with none done in between, after which the fault is not theirs."""
+"""Slices given up one after the other, with no other suspect done in between, after which the fault is not theirs."""
 
 
 def search_slices(
@@ -93,7 +93,7 @@ def search_slices(
             if lost_in_a_row >= LOST_SLICES:
                 raise DetectionError(
                     f"a process that searches for markers was killed {lost_in_a_row} times (memory?) at frame "
-                    f"{part.frame[0]} of camera '{part.camera}'; free some memory or give fewer --workers"
+                    f"{part.frame[0]} of camera '{part.camera}'; free some memory or give fewer --jobs"
                 )
             give_up(part)
             report(part)

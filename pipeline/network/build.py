@@ -8,6 +8,7 @@ import numpy as np
 
 from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody, Motion, StaticBody
+from pipeline.config.prints import described_tags
 from pipeline.config.quantities import Pose, Print
 from pipeline.config.site import Benchmark
 from pipeline.errors import NetworkError
@@ -115,7 +116,7 @@ def network_of(machine: Machine, site: Site, date: datetime.date | None = None) 
         markers.append(Marker(name, "world", index, True))
         prints.append(mark)
     tags = [(k, item.family, tag) for k, item in enumerate(prints) for tag in item.tags]
-    _refuse_shared_tags(markers, tags)
+    described_tags(machine, site)
 
     sensors = []
     for name, sensor in machine.sensors.items():
@@ -266,14 +267,3 @@ def _worn_tool(machine: Machine, date: datetime.date | None) -> Static:
     cov = A @ edge.mount.covariance_xi() @ A.T
     cov[2, 2] += sigma_m**2
     return _pose_static("cutting edge mount", "cutting edge", edge.mount.transform() @ T_mount_tool, cov)
-
-
-def _refuse_shared_tags(markers, tags) -> None:
-    owner: dict[tuple[str, int], int] = {}
-    for k, family, tag in tags:
-        other = owner.setdefault((family, tag.id), k)
-        if other != k:
-            raise NetworkError(
-                f"tag {tag.id} of {family} stands on both '{markers[other].name}' and '{markers[k].name}'; "
-                f"every tag in view must be one of a kind"
-            )

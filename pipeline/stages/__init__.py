@@ -141,7 +141,7 @@ class Stage:
 
 STAGES = (
     Stage("ingest", 1, "reading the log", (), ("log",), ("frames", "sensors"), _reading),
-    Stage("detect", 6, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
+    Stage("detect", 7, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
         16,

@@ -10,8 +10,9 @@ from datetime import UTC, datetime
 import numpy as np
 
 from pipeline import tables
+from pipeline.config.prints import described_tags
 from pipeline.config.quantities import FAMILIES, dictionary_of, smallest_family
-from pipeline.detection.acceptance import ACCEPTED, UNKNOWN_ID, KnownTags
+from pipeline.detection.acceptance import ACCEPTED, BIT_ERRORS, LOW_MARGIN, UNKNOWN_ID, KnownTags
 from pipeline.detection.apriltag import TagFinder
 from pipeline.detection.boards import Board
 from pipeline.detection.decode import decode_grey
@@ -19,7 +20,7 @@ from pipeline.detection.found import Found, sides_px
 from pipeline.detection.prints import SURE_BITS, spare_bits
 from pipeline.detection.slices import CORRUPT, LOST, SEARCHED, Search, given_up, read_piece
 from pipeline.detection.spans import Slice, frames_of, slices_of
-from pipeline.detection.stillness import warnings
+from pipeline.detection.stillness import Tag, warnings
 from pipeline.detection.tally import Tally
 from pipeline.detection.workers import search_slices
 from pipeline.errors import DetectionError
@@ -32,6 +33,8 @@ NEARLY_ALL = 0.9
 PORTION_ROWS = 65_536
 LOOKS = 12
 """Frames in which other families are looked for, when nothing at all was seen."""
+OFTEN = 3
+"""Sightings from which a tag that nothing describes is told of beside those that were never used."""
 CERTAIN_MARGIN = 50.0
 """Decision margin that patterns of soil do not reach."""
 
@@ -81,13 +84,15 @@ def run(job: Job, progress: Progress) -> Counts:
         status.update(tally.status)
         seen.update(tally.unknown)
     if not status[ACCEPTED]:
-        others = _other_families(search, slices) if not status else Counter()
+        # What is followed as a covered tag may be a tag of a family that nobody described.
+        others = _other_families(search, slices) if not seen else Counter()
         _refuse_without_markers(job, frames, status, seen + others, known)
     for camera, tally in tallies.items():
         if not tally.status[ACCEPTED]:
             progress.warn(f"camera '{camera}': not one marker was accepted in its frames")
         for sentence in warnings(camera, tally.stillness):
             progress.warn(sentence)
+    _warn_of_ids(job, set().union(*(tally.accepted for tally in tallies.values())), seen, progress)
     job.write_json("detection.json", {"cameras": {name: tally.facts() for name, tally in tallies.items()}})
     return {
         "frames": dict(frames.most_common()),
@@ -98,10 +103,10 @@ def run(job: Job, progress: Progress) -> Counts:
 
 
 def known_tags(job: Job) -> dict[str, frozenset[int]]:
-    """Family -> ids that machine.toml and site.toml describe."""
+    """Family -> ids that machine.toml and site.toml describe. Raises ConfigError where one is described twice."""
     ids: dict[str, set[int]] = {}
-    for marker in [*job.machine.markers.values(), *job.site.benchmarks.values()]:
-        ids.setdefault(marker.family, set()).update(tag.id for tag in marker.tags)
+    for family, number in described_tags(job.machine, job.site):
+        ids.setdefault(family, set()).add(number)
     return {family: frozenset(numbers) for family, numbers in sorted(ids.items())}
 
 
@@ -195,6 +200,26 @@ def _believable(tags: Found) -> set[tuple[str, int]]:
     return {(str(tags.family[k]), int(tags.tag_id[k])) for k in kept}
 
 
+def _warn_of_ids(job: Job, accepted: set[Tag], unknown: Counter[Tag], progress: Progress) -> None:
+    """Say which described tags were never used, where tags were seen that nothing describes: an id may be wrong."""
+    seen = [tag for tag, count in sorted(unknown.items()) if count >= OFTEN]
+    lacking = [tag for tag in described_tags(job.machine, job.site) if tag not in accepted]
+    if seen and lacking:
+        owner = described_tags(job.machine, job.site)
+        never = ", ".join(f"{tag[1]} of '{owner[tag]}'" for tag in lacking[:12])
+        progress.warn(
+            f"never used: {_tags(lacking[:12])} ({never}); seen, and described by neither file: {_tags(seen[:12])}; "
+            "if a tag of them is the other, correct its id or family"
+        )
+
+
+def _tags(tags: Sequence[Tag]) -> str:
+    families: dict[str, list[int]] = {}
+    for family, number in tags:
+        families.setdefault(family, []).append(number)
+    return "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in sorted(families.items()))
+
+
 def _refuse_without_markers(
     job: Job,
     frames: Counter[str],
@@ -205,10 +230,7 @@ def _refuse_without_markers(
     expected = "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in known.items())
     where = f"{job.log.name}: in {frames[SEARCHED]} frames"
     if seen:
-        names: dict[str, list[int]] = {}
-        for (family, number), _ in seen.most_common(40):
-            names.setdefault(family, []).append(number)
-        found = "; ".join(f"{family} {_ids(sorted(numbers))}" for family, numbers in sorted(names.items()))
+        found = _tags([tag for tag, _ in seen.most_common(40)])
         raise DetectionError(
             f"{where} only marker ids were seen that nothing describes: {found}; described are {expected}; "
             "correct the ids or the family in machine.toml and site.toml"
@@ -216,9 +238,11 @@ def _refuse_without_markers(
     others = {name: count for name, count in status.items() if name not in (ACCEPTED, UNKNOWN_ID)}
     if others:
         reasons = ", ".join(f"{name} {count}" for name, count in sorted(others.items()))
+        advice = "uncover them, or use larger or nearer ones"
+        if set(others) & {LOW_MARGIN, BIT_ERRORS}:
+            advice = "use larger or nearer markers, or loosen detection.min_margin and detection.max_hamming"
         raise DetectionError(
-            f"{where} no marker could be accepted ({reasons}); described are {expected}; use larger or nearer markers, "
-            "or loosen detection.min_margin and detection.max_hamming in site.toml"
+            f"{where} no marker could be accepted ({reasons}); described are {expected}; {advice}"
         )
     raise DetectionError(
         f"{where} no marker was seen at all; described are {expected}; check the family, that the markers are in "

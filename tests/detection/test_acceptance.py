@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.config.site import DetectionSettings
-from pipeline.detection.acceptance import judge
+from pipeline.detection.acceptance import ghosts, judge
 from pipeline.detection.refine import REASONS
 from pipeline.detection.seen import FOLLOWED, NO_TRACK, SEARCHED, Seen
 
@@ -46,6 +46,21 @@ def test_each_reason_is_told():
     assert statuses((1, 100, 100, {"hamming": 2})) == ["bit errors"]
     for reason in REASONS[1:]:
         assert statuses((1, 100, 100, {"reason": reason})) == [reason]
+
+
+def test_a_covered_tag_on_another_tag_or_seen_elsewhere_is_none():
+    covered = {"reason": "covered", "how": FOLLOWED}
+    tags = seen(
+        (1, 100, 100),
+        (2, 104, 98, covered),  # on tag 1
+        (3, 300, 300, covered),  # alone
+        (1, 400, 300, covered),  # tag 1 is elsewhere
+        (2, 100, 100, covered),  # on tag 1, but in another picture
+        (3, 103, 100, {"reason": "covered"}),  # a search has read it
+    )
+    picture = np.array([0, 0, 0, 0, 1, 0])
+    status = judge(tags, {"tag36h11": {1, 2, 3}}, SETTINGS, picture)
+    assert ghosts(tags, status, picture).tolist() == [False, True, False, True, False, False]
 
 
 def test_of_several_reasons_the_gravest_is_told():

@@ -141,7 +141,7 @@ def test_workers_that_vanish_whatever_they_do_end_the_job(shift, tmp_path, monke
     gone = Search(
         tmp_path / "gone.mcap", search.contents, search.families, KNOWN, search.sizes, search.settings
     )
-    with pytest.raises(DetectionError, match=r"killed 1 times.*camera 'front'.*--workers"):
+    with pytest.raises(DetectionError, match=r"killed 1 times.*camera .front..*--jobs"):
         search_slices(gone, slices, 2)
 
 

@@ -124,6 +124,34 @@ def test_unknown_ids_only_names_what_was_seen_and_what_is_described(shift, tmp_p
         both(tmp_path, log)
 
 
+def test_a_tag_that_both_files_describe_is_told_before_anything_is_searched(shift, tmp_path):
+    site = SITE.replace('family = "tag25h9"', 'family = "tag36h11"').replace("id = 2", "id = 1")
+    job = open_job(shift.parent, shift, runs=str(tmp_path), site=site)
+    try:
+        ingested(job)
+        with pytest.raises(
+            ConfigError, match=r"tag 1 of tag36h11 stands on both '\w+' and '\w+'.*correct the id"
+        ):
+            detected(job)
+    finally:
+        open_job(shift.parent, shift, runs=str(tmp_path))
+
+
+def test_a_wrong_id_is_told_beside_what_was_seen(shift, tmp_path):
+    site = SITE.replace("id = 2", "id = 3")
+    job = open_job(shift.parent, shift, runs=str(tmp_path), site=site)
+    try:
+        ingested(job)
+        _, watch, _ = detected(job)
+        assert any(
+            "never used: tag25h9 id 3 (3 of '" in sentence
+            and "described by neither file: tag25h9 id 2" in sentence
+            for sentence in watch.warnings
+        ), watch.warnings
+    finally:
+        open_job(shift.parent, shift, runs=str(tmp_path))
+
+
 def test_a_wrong_family_is_found_out(shift, tmp_path):
     """Nothing described is in view; the tags that are belong to families nobody named."""
     machine = MACHINE.replace('family = "tag36h11"', 'family = "tagStandard41h12"')

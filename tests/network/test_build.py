@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pipeline.config import Machine, Site
-from pipeline.errors import NetworkError
+from pipeline.errors import ConfigError, NetworkError
 from pipeline.geometry import se3, so3
 from pipeline.network import network_of
 from pipeline.network.build import rigid_fit
@@ -124,7 +124,7 @@ def test_corners_that_do_not_fit_the_print_are_refused_in_words():
 def test_a_tag_on_two_markers_and_a_name_used_twice_are_refused():
     machine = copy.deepcopy(MACHINE)
     machine["markers"]["stick"]["tags"][0]["id"] = 0
-    with pytest.raises(NetworkError, match=r"tag 0 of tag36h11 stands on both 'stick' and 'B1'"):
+    with pytest.raises(ConfigError, match=r"tag 0 of tag36h11 stands on both 'stick' and 'B1'"):
         _network(machine)
     machine = copy.deepcopy(MACHINE)
     machine["markers"]["B1"] = machine["markers"].pop("stick")
