@@ -19,13 +19,12 @@ from pipeline.detection.image_model import (
     linearise,
 )
 from pipeline.detection.integrity import noise_on_edges, point
-from pipeline.detection.veil import eliminate_veil
+from pipeline.detection.veil import ROWS, eliminate_veil
 
 COARSE_STEP_PX = 0.6
 """A step this short ends the steps on a part of the pixels."""
 PLAIN, BY_CELL, VEILED = range(3)
 """Light: as the model has it; each cell with a brightness of its own; with a veil over the print."""
-ROWS = 384
 LEAST_PIXELS, LEAST_ON_EDGES = 40, 30
 """Fewer determine no print."""
 LEAST_VARIANCE = 0.06

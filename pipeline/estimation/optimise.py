@@ -174,10 +174,8 @@ def _settled(
         of_freed = Iterations(log.checkpoint, f"{log.name} freed")
         found = pull.freed(problem, at.values, at.weights, limit, of_freed)
     if found is None:
-        eased, found = (
-            False,
-            _iterate(problem, at.values, at.weights, limit, irls, log, near_enough=approached),
-        )
+        eased = False
+        found = _iterate(problem, at.values, at.weights, limit, irls, log, near_enough=approached)
     values, used, converged, left, cost = found
     return Optimum(values, at.weights, at.iterations + used, converged, left, cost, eased)
 

@@ -203,9 +203,9 @@ def _believable(tags: Found) -> set[tuple[str, int]]:
 def _warn_of_ids(job: Job, accepted: set[Tag], unknown: Counter[Tag], progress: Progress) -> None:
     """Say which described tags were never used, where tags were seen that nothing describes: an id may be wrong."""
     seen = [tag for tag, count in sorted(unknown.items()) if count >= OFTEN]
-    lacking = [tag for tag in described_tags(job.machine, job.site) if tag not in accepted]
+    owner = described_tags(job.machine, job.site)
+    lacking = [tag for tag in owner if tag not in accepted]
     if seen and lacking:
-        owner = described_tags(job.machine, job.site)
         never = ", ".join(f"{tag[1]} of '{owner[tag]}'" for tag in lacking[:12])
         progress.warn(
             f"never used: {_tags(lacking[:12])} ({never}); seen, and described by neither file: {_tags(seen[:12])}; "
@@ -238,9 +238,11 @@ def _refuse_without_markers(
     others = {name: count for name, count in status.items() if name not in (ACCEPTED, UNKNOWN_ID)}
     if others:
         reasons = ", ".join(f"{name} {count}" for name, count in sorted(others.items()))
-        advice = "uncover them, or use larger or nearer ones"
+        advice = "use larger or nearer markers"
         if set(others) & {LOW_MARGIN, BIT_ERRORS}:
-            advice = "use larger or nearer markers, or loosen detection.min_margin and detection.max_hamming"
+            advice += ", or loosen detection.min_margin and detection.max_hamming in site.toml"
+        else:
+            advice += ", and uncover them"
         raise DetectionError(
             f"{where} no marker could be accepted ({reasons}); described are {expected}; {advice}"
         )

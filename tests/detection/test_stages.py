@@ -1,6 +1,7 @@
 """ingest and detect on a small log: what stands in the tables, what is said of a bad log."""
 
 import json
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -31,6 +32,17 @@ def both(folder, log, **options):
     job = open_job(folder, log, **options)
     ingested(job)
     return detected(job)
+
+
+@contextmanager
+def described_otherwise(shift, folder, **files):
+    """A job of the log, ingested, with other files beside it as long as it lasts."""
+    job = open_job(shift.parent, shift, runs=str(folder), **files)
+    try:
+        ingested(job)
+        yield job
+    finally:
+        open_job(shift.parent, shift, runs=str(folder))
 
 
 def test_a_sound_log_gives_its_tables_and_no_warning(shift, tmp_path):
@@ -126,45 +138,31 @@ def test_unknown_ids_only_names_what_was_seen_and_what_is_described(shift, tmp_p
 
 def test_a_tag_that_both_files_describe_is_told_before_anything_is_searched(shift, tmp_path):
     site = SITE.replace('family = "tag25h9"', 'family = "tag36h11"').replace("id = 2", "id = 1")
-    job = open_job(shift.parent, shift, runs=str(tmp_path), site=site)
-    try:
-        ingested(job)
-        with pytest.raises(
-            ConfigError, match=r"tag 1 of tag36h11 stands on both '\w+' and '\w+'.*correct the id"
-        ):
-            detected(job)
-    finally:
-        open_job(shift.parent, shift, runs=str(tmp_path))
+    twice = pytest.raises(
+        ConfigError, match=r"tag 1 of tag36h11 stands on both '\w+' and '\w+'.*correct the id"
+    )
+    with described_otherwise(shift, tmp_path, site=site) as job, twice:
+        detected(job)
 
 
 def test_a_wrong_id_is_told_beside_what_was_seen(shift, tmp_path):
-    site = SITE.replace("id = 2", "id = 3")
-    job = open_job(shift.parent, shift, runs=str(tmp_path), site=site)
-    try:
-        ingested(job)
+    with described_otherwise(shift, tmp_path, site=SITE.replace("id = 2", "id = 3")) as job:
         _, watch, _ = detected(job)
-        assert any(
-            "never used: tag25h9 id 3 (3 of '" in sentence
-            and "described by neither file: tag25h9 id 2" in sentence
-            for sentence in watch.warnings
-        ), watch.warnings
-    finally:
-        open_job(shift.parent, shift, runs=str(tmp_path))
+    assert any(
+        "never used: tag25h9 id 3 (3 of '" in sentence
+        and "described by neither file: tag25h9 id 2" in sentence
+        for sentence in watch.warnings
+    ), watch.warnings
 
 
 def test_a_wrong_family_is_found_out(shift, tmp_path):
     """Nothing described is in view; the tags that are belong to families nobody named."""
     machine = MACHINE.replace('family = "tag36h11"', 'family = "tagStandard41h12"')
     site = SITE.replace('family = "tag25h9"', 'family = "tagStandard41h12"')
-    job = open_job(shift.parent, shift, runs=str(tmp_path), machine=machine, site=site)
-    try:
-        ingested(job)
-        with pytest.raises(
-            DetectionError, match=r"tag25h9 id 2; tag36h11 ids 1, 9; described are tagStandard41h12 ids 1, 2"
-        ):
-            detected(job)
-    finally:
-        open_job(shift.parent, shift, runs=str(tmp_path))
+    told = r"tag25h9 id 2; tag36h11 ids 1, 9; described are tagStandard41h12 ids 1, 2"
+    other = described_otherwise(shift, tmp_path, machine=machine, site=site)
+    with other as job, pytest.raises(DetectionError, match=told):
+        detected(job)
 
 
 def test_a_wrong_aruco_dictionary_is_found_out_and_the_smallest_that_fits_is_named(tmp_path):
