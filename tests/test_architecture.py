@@ -49,6 +49,7 @@ BORDERS = {
     "simplejpeg": {"detection", "synthetic"},
     "pyapriltags": {"detection"},
     "defusedxml": {"surface"},
+    "ezdxf": {"surface"},
 }
 FORBIDDEN_NAMES = {"utils", "util", "helpers", "helper", "common", "types", "misc"}
 MAX_LINES = 420
