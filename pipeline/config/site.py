@@ -134,13 +134,44 @@ class Design(Section):
     """LandXML: name of the alignment; may be left out if [alignment] stands in this file."""
 
 
+class Ground(Section):
+    """The ground before digging, for volumes: one level, or a surface of a LandXML file."""
+
+    elevation: float | None = None
+    """Grid unit."""
+    file: str | None = None
+    """Beside site.toml; it may be the file of the design."""
+    surface: str | None = None
+    """Name of the surface in that file; may be left out if there is only one."""
+    sigma_mm: Positive
+    """Of the level of the ground, the same error everywhere: stubble, ruts, the age of the survey."""
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Ground:
+        if (self.elevation is None) == (self.file is None):
+            raise ValueError("give either elevation, or file with the LandXML surface of the ground")
+        if self.surface is not None and self.file is None:
+            raise ValueError("surface names a surface of a file: give file as well")
+        return self
+
+
 class Tolerance(Section):
     """Deviation = as-built minus design; + is high (under-dug), - is low (over-dug)."""
 
     high_mm: NonNegative
     low_mm: NonNegative
+    wide_mm: NonNegative | None = None
+    """How far a side of the floor may lie outside the designed one; with narrow_mm, or the sides are not judged."""
+    narrow_mm: NonNegative | None = None
+    """How far inside."""
     coverage_factor: Positive = 2.0
     """k in U = k sigma."""
+
+    @model_validator(mode="after")
+    def _both_sides(self) -> Tolerance:
+        if (self.wide_mm is None) != (self.narrow_mm is None):
+            raise ValueError("the sides are judged with both wide_mm and narrow_mm; give both or neither")
+        return self
 
 
 class Checks(Section):
@@ -226,6 +257,7 @@ class Site(Section):
     """None are needed where a surveyed site camera (`body = "world"` in machine.toml) sees the machine."""
     alignment: Alignment | None = None
     design: Design
+    ground: Ground | None = None
     tolerance: Tolerance
     checks: Checks | None = None
     detection: DetectionSettings = DetectionSettings()

@@ -41,7 +41,7 @@ class ReportInputs:
     design: Design | None = None
     """The design, to draw it beside what was dug."""
     tables: Mapping[str, Table] = field(default_factory=dict)
-    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, checks."""
+    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, sides, volumes, checks."""
     detections: Mapping[str, Table] = field(default_factory=dict)
     """By camera; columns time_ns, tag_id and status."""
     log_facts: Mapping[str, Any] = field(default_factory=dict)

@@ -15,7 +15,18 @@ import numpy as np
 from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
-from pipeline.report import charts, detector, evidence, facts, maps, measured, numbers, palette, profiles
+from pipeline.report import (
+    charts,
+    detector,
+    evidence,
+    facts,
+    maps,
+    measured,
+    numbers,
+    palette,
+    profiles,
+    quantities,
+)
 from pipeline.report.attention import attention
 from pipeline.report.consistency import consistency
 from pipeline.report.drawing import house_style, svg_of
@@ -83,6 +94,9 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "stations_beyond": beyond,
         "cells": None if grid is None else measured.cells_table(inputs, grid, units, words),
         "cross_sections": measured.sections_table(sections, units, words) if sections else None,
+        "wanted": quantities.wanted_shots(inputs, units, words),
+        "quantities": quantities.quantities(inputs, units, words),
+        "sides": quantities.sides_table(inputs, units, words),
         "checks": None if checks is None else measured.checks_table(checks, units, words),
         "check_statistics": _labelled_statistics(statistics, words),
         "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
@@ -184,6 +198,19 @@ def _figures(
             )
         else:
             add("cross_sections", "as_built", None)
+        outward = None if (told := inputs.table("sides")) is None else told["outward"]
+        if told is not None and outward is not None and np.isfinite(outward).any():
+            known = np.isfinite(outward)
+            add(
+                "sides",
+                "",
+                lambda: profiles.sides(inputs, told, units),
+                n=len(np.unique(told["station"][known])),
+                low=facts.deviation_text(outward[known].min(), units),
+                high=facts.deviation_text(outward[known].max(), units),
+            )
+        else:
+            add("sides", "sides", None)
         if grid is not None:
             count = {
                 name: int((grid.values["floor"] & (grid.values["state"] == name)).sum())

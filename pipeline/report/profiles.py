@@ -270,6 +270,35 @@ def _limits(section: Section, low: float, high: float) -> tuple[float, float]:
     return float(np.nanmin(known)), float(np.nanmax(known))
 
 
+def sides(inputs: ReportInputs, table: Table, units: Units) -> Figure:
+    """How far each side of the floor lies outside its design, by station, with two standard deviations."""
+    figure = new_figure(2.4)
+    ax = figure.subplots()
+    side = np.asarray(table["side"], str)
+    tolerance = inputs.site.tolerance
+    if tolerance.wide_mm is not None and tolerance.narrow_mm is not None:
+        low, high = units.to_deviation([-tolerance.narrow_mm / 1000, tolerance.wide_mm / 1000])
+        ax.axhspan(low, high, color=palette.BAND, lw=0, label="tolerance")
+    ax.axhline(0, color=palette.DESIGN, lw=0.9, ls=(0, (5, 2)))
+    reach = np.isfinite(table["outward"])
+    stations = np.asarray(table["station"], float)
+    for name, colour, marker in (("left", palette.ACCENTS[0], "o"), ("right", palette.ACCENTS[1], "s")):
+        at = side == name
+        x = units.to_length(stations[at])
+        y = units.to_deviation(np.asarray(table["outward"], float)[at])
+        half = SIGMAS * units.to_deviation(np.hypot(table["sigma_own"], table["sigma_common"])[at])
+        ax.fill_between(x, y - half, y + half, color=colour, alpha=0.18, lw=0)
+        ax.plot(x, y, color=colour, marker=marker, ms=3, lw=1.0, label=f"{name} side")
+    if reach.any():
+        first, last = units.to_length([stations[reach].min(), stations[reach].max()])
+        margin = 0.03 * max(last - first, 1.0)
+        ax.set_xlim(first - margin, last + margin)
+    ax.set_xlabel(f"Station [{units.length}]")
+    ax.set_ylabel(f"− narrow   outward [{units.deviation}]   + wide")
+    figure.legend(loc="outside upper right", ncols=3, handlelength=1.6)
+    return figure
+
+
 def check_shots(checks: Table, units: Units) -> Figure:
     """Difference of each compared shot with two combined sigmas, by station."""
     compared = np.isfinite(np.asarray(checks["difference"], float))

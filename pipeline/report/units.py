@@ -42,6 +42,29 @@ class Units:
         """Metres -> deviation unit; arrays and numbers alike."""
         return np.asarray(metres, float) * self.deviation_per_metre
 
+    @property
+    def area(self) -> str:
+        """Unit of areas, as printed."""
+        return "m²" if self.length == "m" else f"sq {self.length}"
+
+    @property
+    def volume(self) -> str:
+        """Unit of volumes, as printed: soil is paid by the cubic metre or the cubic yard."""
+        return "m³" if self.length == "m" else "cu yd"
+
+    @property
+    def volume_digits(self) -> int:
+        """Digits after the point of a volume."""
+        return 2
+
+    def to_area(self, square_metres: Any) -> Any:
+        """Square metres -> area unit."""
+        return np.asarray(square_metres, float) * self.per_metre**2
+
+    def to_volume(self, cubic_metres: Any) -> Any:
+        """Cubic metres -> volume unit."""
+        return np.asarray(cubic_metres, float) * (1.0 if self.length == "m" else self.per_metre**3 / 27.0)
+
     def describe(self) -> str:
         """The units in words, for the page's method."""
         return f"{UNIT_NAMES[self.length]} ({self.length}), deviations in {UNIT_NAMES[self.deviation]}"

@@ -101,7 +101,7 @@ def _tracking(job: Job) -> Settings:
 
 
 def _surveying(job: Job) -> Settings:
-    wanted = {"grid", "alignment", "design", "tolerance", "checks", "survey"}
+    wanted = {"grid", "alignment", "design", "ground", "tolerance", "checks", "survey"}
     return {
         "width_m": job.machine.cutting_edge.width_m,
         **job.site.model_dump(mode="json", include=wanted),
@@ -132,7 +132,7 @@ class Stage:
     needs: tuple[str, ...]
     """Stages whose outputs it reads."""
     reads: tuple[str, ...]
-    """`log`, and which of the files that site.toml names: `design`, `checks`."""
+    """`log`, and which of the files that site.toml names: `design`, `ground`, `checks`."""
     tables: tuple[str, ...]
     """Tables it writes."""
     settings: Callable[[Job], Settings]
@@ -154,16 +154,16 @@ STAGES = (
     Stage("track", 1, "poses and cutting edge", ("estimate",), (), ("poses", "cutting_edge"), _tracking),
     Stage(
         "survey",
-        1,
+        2,
         "as-built against design",
         ("estimate", "track"),
-        ("design", "checks"),
-        ("as_built", "stations", "checks"),
+        ("design", "ground", "checks"),
+        ("as_built", "stations", "sides", "volumes", "checks"),
         _surveying,
     ),
     Stage(
         "report",
-        2,
+        3,
         "writing the report",
         ("ingest", "detect", "estimate", "track", "survey"),
         ("log", "design", "checks"),

@@ -261,6 +261,8 @@ def _attached(attachments: dict[str, bytes], kind: str, log: Path) -> bytes:
 def named_files(site: Site, source: Source, folder: RunFolder) -> dict[str, NamedFile]:
     """The files that site.toml names, hashed. Raises ConfigError where one is missing or lies elsewhere."""
     wanted = {"design": site.design.file} | ({"checks": site.checks.file} if site.checks else {})
+    if site.ground is not None and site.ground.file is not None:
+        wanted["ground"] = site.ground.file
     found = {}
     for key, name in wanted.items():
         path = resolve_named_file(source.folder, name, f"{source.name}: {key}.file")

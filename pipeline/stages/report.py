@@ -23,6 +23,8 @@ COLUMNS: dict[str, list[str] | None] = {
     "cutting_edge": ["time_ns", "point", "seen"],
     "as_built": None,
     "stations": None,
+    "sides": None,
+    "volumes": None,
     "checks": None,
 }
 """Columns that the page needs of each table; a shift has millions of rows of some."""

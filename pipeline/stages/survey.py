@@ -12,6 +12,12 @@
         "rules": {"surface": sentence, "floor": sentence, "decision": sentence},
         "tolerance": {"high", "low", "coverage_factor"},
         "deviation": {"mean", "worst", "worst_station", "median_expanded_uncertainty"},
+        "reach": {"first", "last", "dug", "gaps": [[from, to], ...], "sigma"},
+        "volumes": [{"kind", "m3", "sigma_own", "sigma_common", "area"}, ...],
+        "left_where_not_cut": m3,
+        "uncut_floor": m2,
+        "side_tolerance": {"wide", "narrow"} or null,
+        "wanted_shots": {"shots": [{"station", "settles"}, ...], "open", "partly", "best_alone", "sigma_shot"},
         "surface": {
             "cell",
             "cells_floor",
@@ -49,29 +55,41 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.site import Tolerance
 from pipeline.stages.job import Counts, Job, Progress
 from pipeline.surface import table
-from pipeline.surface.as_built import AsBuilt, SurfaceRule, as_built
+from pipeline.surface.as_built import AsBuilt, Reach, SurfaceRule, as_built, reach_of
 from pipeline.surface.checks import OUTSIDE_ALIGNMENT, OUTSIDE_CUT, Comparison, compare, summarise
 from pipeline.surface.decision import (
     CANNOT_TELL,
     FAIL,
     NOT_REACHED,
     PASS,
+    SideVerdicts,
     Stations,
     ToleranceBand,
     job_verdict,
     judge,
+    judge_sides,
     stations_along,
+    with_sides,
 )
 from pipeline.surface.design import Design, TinDesign, floor_sentence, read_design
+from pipeline.surface.ground import read_ground
 from pipeline.surface.shots import Shots, check_order, read_shots
+from pipeline.surface.sides import sides
+from pipeline.surface.sweep import path_along
+from pipeline.surface.volumes import Volume, volumes
+from pipeline.surface.wanted_shots import wanted_shots
 from pipeline.tables import NULL_INT, empty_columns
 from pipeline.tracks.table import EDGE_COLUMNS, cutting_edge_from_columns
 
+SIGMA_SHOT_M = 0.002
+"""Of a total-station shot, where site.toml states none: what its [checks] default to."""
+
 
 def run(job: Job, progress: Progress) -> Counts:
-    """Write `as_built`, `stations`, `checks` and `survey.json`.
+    """Write `as_built`, `stations`, `sides`, `volumes`, `checks` and `survey.json`.
 
     Raises SurfaceError for a design, an alignment or check shots that cannot be used.
     """
@@ -80,12 +98,15 @@ def run(job: Job, progress: Progress) -> Counts:
     progress.total(4, "steps")
     # What a person can get wrong is read before anything is computed.
     design, alignment = read_design(job.files["design"].path, site)
+    ground_file = job.files.get("ground")
+    ground = read_ground(ground_file.path if ground_file else None, site, alignment)
     shots = _shots(job, design, alignment)
     progress.advance()
 
     edge = cutting_edge_from_columns(job.read_table("cutting_edge", EDGE_COLUMNS))
     rule = SurfaceRule(surface=site.survey.surface)
-    built = as_built(edge, alignment, design, site.survey.cell_m, rule)
+    path = path_along(edge, alignment, rule.sweep)
+    built = as_built(edge, alignment, design, site.survey.cell_m, rule, path)
     progress.advance()
 
     band = ToleranceBand(
@@ -94,11 +115,22 @@ def run(job: Job, progress: Progress) -> Counts:
     step_m = site.station_step_m
     where = stations_along(design, alignment.start_station, alignment.end_station, step_m)
     stations = judge(built, design, where, step_m, band)
+    both_sides = sides(path, built, design, where, step_m, rule.sweep)
+    judged: SideVerdicts | None = None
+    across = _side_band(site.tolerance)
+    if across is not None:
+        judged = judge_sides(both_sides, across)
+        stations = with_sides(stations, judged)
     verdict = job_verdict(stations)
+    soil = volumes(built, design, ground, both_sides.rows, where, step_m)
+    sigma_shot_m = site.checks.sigma_mm / 1000 if site.checks else SIGMA_SHOT_M
+    wanted = wanted_shots(stations, band, sigma_shot_m)
     progress.advance()
 
     job.write_table("as_built", table.columns_of_as_built(built, NULL_INT))
     job.write_table("stations", table.columns_of_stations(stations))
+    job.write_table("sides", table.columns_of_sides(both_sides, judged))
+    job.write_table("volumes", table.columns_of_volumes(soil))
     checks: dict[str, Any] | None = None
     if shots is not None and shots.mended:
         progress.warn(
@@ -146,6 +178,18 @@ def run(job: Job, progress: Progress) -> Counts:
                 "coverage_factor": band.coverage_factor,
             },
             "deviation": _deviation_facts(stations),
+            "reach": _reach_facts(reach_of(built)),
+            "volumes": [_volume_facts(volume) for volume in soil.job],
+            "left_where_not_cut": _or_null(soil.not_reached_m3),
+            "uncut_floor": soil.uncut_m2,
+            "side_tolerance": None if across is None else {"wide": across.high_m, "narrow": across.low_m},
+            "wanted_shots": {
+                "shots": [asdict(shot) for shot in wanted.shots],
+                "open": wanted.open,
+                "partly": wanted.partly,
+                "best_alone": wanted.best_alone,
+                "sigma_shot": sigma_shot_m,
+            },
             "surface": _surface_facts(built),
             "checks": checks,
         },
@@ -174,6 +218,13 @@ def run(job: Job, progress: Progress) -> Counts:
         counted["check shots"] = checks["shots"]
         counted["of these compared"] = checks["n"]
     return counted
+
+
+def _side_band(tolerance: Tolerance) -> ToleranceBand | None:
+    """The tolerance of the sides, + wide, where site.toml gives one."""
+    if tolerance.wide_mm is None or tolerance.narrow_mm is None:
+        return None
+    return ToleranceBand(tolerance.wide_mm / 1000, tolerance.narrow_mm / 1000, tolerance.coverage_factor)
 
 
 def _shots(job: Job, design: Design, alignment) -> Shots | None:
@@ -215,6 +266,30 @@ def _deviation_facts(stations: Stations) -> dict[str, float | None]:
         "worst_station": float(stations.station[known[worst]]),
         "median_expanded_uncertainty": float(np.median(stations.expanded_uncertainty[known])),
     }
+
+
+def _reach_facts(reach: Reach) -> dict[str, Any]:
+    return {
+        "first": _or_null(reach.first),
+        "last": _or_null(reach.last),
+        "dug": reach.dug,
+        "gaps": [list(gap) for gap in reach.gaps],
+        "sigma": reach.sigma,
+    }
+
+
+def _volume_facts(volume: Volume) -> dict[str, Any]:
+    return {
+        "kind": volume.kind,
+        "m3": _or_null(volume.m3),
+        "sigma_own": _or_null(volume.sigma_own_m3),
+        "sigma_common": _or_null(volume.sigma_common_m3),
+        "area": volume.area_m2,
+    }
+
+
+def _or_null(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
 
 
 def _surface_facts(built: AsBuilt) -> dict[str, Any]:

@@ -113,6 +113,7 @@ def as_built(
     design: Design,
     cell_m: float,
     rule: SurfaceRule | None = None,
+    path: EdgePath | None = None,
 ) -> AsBuilt:
     """The as-built surface of a trench.
 
@@ -128,6 +129,8 @@ def as_built(
         Side of a cell.
     rule : SurfaceRule, optional
         What counts as cut.
+    path : EdgePath, optional
+        The edge along the alignment, where the caller has it already (`path_along`).
 
     Raises
     ------
@@ -135,7 +138,7 @@ def as_built(
         The edge never was over the alignment, or the grid would be too large.
     """
     rule = rule or SurfaceRule()
-    path = path_along(edge, alignment, rule.sweep)
+    path = path_along(edge, alignment, rule.sweep) if path is None else path
     grid = grid_around(path, edge, alignment, design, cell_m, rule)
     station, offset = np.meshgrid(grid.station, grid.offset, indexing="ij")
     design_h = design.elevation(station, offset)
@@ -178,6 +181,39 @@ def as_built(
         ),
         excess_m=chosen.excess_m,
         excess_share=chosen.excess_share,
+    )
+
+
+@dataclass(frozen=True)
+class Reach:
+    """How far the trench was dug; metres."""
+
+    first: float
+    """Station at which the first row of cells was cut over half its floor or more; nan without such a row."""
+    last: float
+    dug: float
+    """Length that was dug in all."""
+    gaps: tuple[tuple[float, float], ...]
+    """Stretches between first and last that were not."""
+    sigma: float
+    """Standard deviation of either end: the rounding to whole cells."""
+
+
+def reach_of(built: AsBuilt) -> Reach:
+    """The chainage that was reached: rows of cells of which half the floor or more was cut."""
+    floor = built.floor & np.isfinite(built.design_h)
+    cut = np.count_nonzero(floor & built.cut, axis=1)
+    dug = (2 * cut >= np.count_nonzero(floor, axis=1)) & (cut > 0)
+    grid = built.grid
+    rows = np.flatnonzero(dug)
+    sigma = grid.cell_m / float(np.sqrt(12.0))
+    if not len(rows):
+        return Reach(np.nan, np.nan, 0.0, (), sigma)
+    border = grid.first_station + grid.cell_m * np.arange(grid.rows + 1)
+    holes = np.flatnonzero(np.diff(rows) > 1)
+    gaps = tuple((float(border[rows[k] + 1]), float(border[rows[k + 1]])) for k in holes)
+    return Reach(
+        float(border[rows[0]]), float(border[rows[-1] + 1]), float(len(rows) * grid.cell_m), gaps, sigma
     )
 
 

@@ -7,12 +7,14 @@ interval lies outside on one side, and cannot be told otherwise.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
+from pipeline.surface.sides import SIDES, Sides
+from pipeline.surface.sweep import sweeps_of
 
 PASS, FAIL, CANNOT_TELL, NOT_REACHED = "PASS", "FAIL", "CANNOT TELL", "NOT REACHED"
 CUT, PARTLY, UNREACHED = "cut", "partly cut", "not reached"
@@ -52,9 +54,6 @@ class StationRule:
     whole_share: float = 0.75
     """Below this it is partly cut."""
     least_cells: int = 4
-    sweep_gap_s: float = 0.5
-    """Cells whose passes follow each other within this are one sweep and share one own error, wholly. True
-    correlation decays within a sweep; not knowing how fast, the larger sigma is taken."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +74,8 @@ class Stations:
     """Common part; the mean does not reduce it."""
     expanded_uncertainty: np.ndarray
     """U = k sigma."""
+    scatter: np.ndarray
+    """Standard deviation of the cells' deviations about their mean, metres: how far one spot speaks for the station."""
     width: np.ndarray
     """Width of the floor that was cut, metres."""
     cells_cut: np.ndarray
@@ -93,8 +94,14 @@ class JobVerdict:
     """Stations by verdict."""
 
 
-def decide(deviation: float, uncertainty: float, band: ToleranceBand) -> tuple[str, str]:
-    """Verdict and reason for one deviation with its expanded uncertainty, metres.
+LEVEL_WORDS = ("high", "under-dug", "low", "over-dug")
+SIDE_WORDS = ("wide", "outside its design", "narrow", "inside its design")
+
+
+def decide(
+    deviation: float, uncertainty: float, band: ToleranceBand, words: tuple[str, str, str, str] = LEVEL_WORDS
+) -> tuple[str, str]:
+    """Verdict and reason for one deviation with its expanded uncertainty, metres; `words` say what + and - mean.
 
     A deviation that lies outside by more than U is a FAIL however large U is: a poor measurement can still see a
     gross error. A U wider than half the tolerance can never PASS.
@@ -102,9 +109,11 @@ def decide(deviation: float, uncertainty: float, band: ToleranceBand) -> tuple[s
     assert uncertainty >= 0, uncertainty
     low, high = deviation - uncertainty, deviation + uncertainty
     if low > band.high_m:
-        return FAIL, f"high by at least {(low - band.high_m) * 1000:.1f} mm beyond the tolerance (under-dug)"
+        beyond = (low - band.high_m) * 1000
+        return FAIL, f"{words[0]} by at least {beyond:.1f} mm beyond the tolerance ({words[1]})"
     if high < -band.low_m:
-        return FAIL, f"low by at least {(-band.low_m - high) * 1000:.1f} mm beyond the tolerance (over-dug)"
+        beyond = (-band.low_m - high) * 1000
+        return FAIL, f"{words[2]} by at least {beyond:.1f} mm beyond the tolerance ({words[3]})"
     if low >= -band.low_m and high <= band.high_m:
         return PASS, "deviation ± U lies inside the tolerance"
     if uncertainty > band.half_width_m:
@@ -173,6 +182,7 @@ def judge(
             "sigma_own",
             "sigma_common",
             "expanded_uncertainty",
+            "scatter",
             "width",
         )
     }
@@ -198,9 +208,7 @@ def judge(
                 + (f"; {touched - cells_cut[i]} more were passed over" if touched > cells_cut[i] else "")
             )
             continue
-        own = _sigma_own_of_mean(
-            built.sigma_own[rows][cut], built.lowest_time_ns[rows][cut], rule.sweep_gap_s
-        )
+        own = _sigma_own_of_mean(built.sigma_own[rows][cut], built.lowest_time_ns[rows][cut])
         common = float(np.mean(built.sigma_common[rows][cut]))
         uncertainty = band.coverage_factor * float(np.hypot(own, common))
         deviation = float(np.mean(built.deviation[rows][cut]))
@@ -214,6 +222,7 @@ def judge(
         result["design_h"][i] = float(np.mean(built.design_h[rows][cut]))
         result["deviation"][i], result["expanded_uncertainty"][i] = deviation, uncertainty
         result["sigma_own"][i], result["sigma_common"][i] = own, common
+        result["scatter"][i] = float(np.std(built.deviation[rows][cut]))
         result["width"][i] = float(np.count_nonzero(cut, axis=1).mean()) * grid.cell_m
     return Stations(
         station=station,
@@ -224,6 +233,53 @@ def judge(
         reason=reason,
         **result,
     )
+
+
+@dataclass(frozen=True)
+class SideVerdicts:
+    """Verdicts of the sides; arrays (n, 2): left, right."""
+
+    expanded_uncertainty: np.ndarray
+    """U = k sigma, metres; nan where the side is not told."""
+    verdict: np.ndarray
+    """PASS, FAIL, CANNOT TELL; NOT REACHED where the side is not told."""
+    reason: np.ndarray
+
+
+def judge_sides(sides: Sides, band: ToleranceBand) -> SideVerdicts:
+    """Each side of each station against a band whose high is wide and whose low is narrow."""
+    u = band.coverage_factor * np.hypot(sides.sigma_own, sides.sigma_common)
+    verdict, reason = np.full(u.shape, NOT_REACHED, object), np.full(u.shape, "", object)
+    for i, j in np.argwhere(np.isfinite(sides.outward)):
+        verdict[i, j], reason[i, j] = decide(float(sides.outward[i, j]), float(u[i, j]), band, SIDE_WORDS)
+    return SideVerdicts(u, verdict, reason)
+
+
+def with_sides(stations: Stations, sides: SideVerdicts) -> Stations:
+    """The stations with their sides held against them: FAIL if the level or a side fails, PASS if all pass.
+
+    A side that is not told leaves a station that would pass in doubt: its floor may be half as wide as it should be.
+    """
+    verdict, reason = stations.verdict.copy(), stations.reason.copy()
+    for i in np.flatnonzero(stations.verdict != NOT_REACHED):
+        of_sides = sides.verdict[i]
+        for word in (FAIL, CANNOT_TELL, NOT_REACHED):
+            told = [
+                f"{SIDES[j]} side {sides.reason[i, j] or 'not told by any pass'}"
+                for j in (0, 1)
+                if of_sides[j] == word
+            ]
+            if (
+                not told
+                or (verdict[i] == FAIL and word != FAIL)
+                or (verdict[i] == CANNOT_TELL and word == NOT_REACHED)
+            ):
+                continue
+            said = "; ".join(told)
+            found = FAIL if word == FAIL else CANNOT_TELL
+            reason[i] = said if verdict[i] == PASS else f"{reason[i]}; {said}"
+            verdict[i] = found
+    return replace(stations, verdict=verdict, reason=reason)
 
 
 def job_verdict(stations: Stations) -> JobVerdict:
@@ -265,9 +321,6 @@ def _floor_cells(design: Design, station: np.ndarray, step_m: float, cell_m: flo
     return np.floor(np.count_nonzero(on_floor, axis=1) * np.maximum(length, 0.0) / cell_m + 1e-6).astype(int)
 
 
-def _sigma_own_of_mean(sigma: np.ndarray, time_ns: np.ndarray, gap_s: float) -> float:
-    """Own sigma of the mean of cells: wholly correlated within a sweep, independent between sweeps."""
-    order = np.argsort(time_ns, kind="stable")
-    starts = np.flatnonzero(np.append(True, np.diff(time_ns[order]) > gap_s * 1e9))
-    per_sweep = np.add.reduceat(sigma[order], starts) / len(sigma)
-    return float(np.sqrt(np.sum(per_sweep**2)))
+def _sigma_own_of_mean(sigma: np.ndarray, time_ns: np.ndarray) -> float:
+    """Own sigma of the mean of cells."""
+    return float(np.sqrt(np.sum((sweeps_of(sigma, time_ns) / len(sigma)) ** 2)))

@@ -18,6 +18,9 @@ from pipeline.tracks.poses import CuttingEdge
 
 _CHUNK = 65_536
 _NEVER = np.iinfo(np.int64).min // 2
+ONE_SWEEP_S = 0.5
+"""Cells whose passes follow each other within this are one sweep and share one own error, wholly. True correlation
+decays within a sweep; not knowing how fast, the larger sigma is taken."""
 STEEPEST = 3.0
 """Rise per run of a swept triangle, at most, when a horizontal error is turned into a vertical one. Near-vertical
 slivers have any slope, and no cell's height should hang on it."""
@@ -218,6 +221,25 @@ def sweep(
     )  # fmt: skip
     assert np.array_equal(count, np.diff(first))
     return Passes(first, height, sigma_own, sigma_common, time_ns, crossed, lowest, lowest_time)
+
+
+def sweeps_of(sigma: np.ndarray, time_ns: np.ndarray, gap_s: float = ONE_SWEEP_S) -> np.ndarray:
+    """Sums of the sigmas of each sweep's cells, (sweeps,): wholly correlated within one, independent between them.
+
+    Parameters
+    ----------
+    sigma : (n,) array
+        Own standard deviations.
+    time_ns : (n,) int array
+        When each cell's pass was.
+    gap_s : float
+        A longer pause begins another sweep.
+    """
+    if not len(sigma):
+        return np.zeros(0)
+    order = np.argsort(time_ns, kind="stable")
+    starts = np.flatnonzero(np.append(True, np.diff(time_ns[order]) > gap_s * 1e9))
+    return np.add.reduceat(sigma[order], starts)
 
 
 def _axes(alignment: Alignment, station: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,4 +1,4 @@
-"""The columns of ``as_built``, ``stations`` and ``checks``."""
+"""The columns of the tables that the survey writes."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ import numpy as np
 
 from pipeline.surface.as_built import STATE_NAMES, AsBuilt
 from pipeline.surface.checks import Comparison
-from pipeline.surface.decision import Stations
+from pipeline.surface.decision import SideVerdicts, Stations
 from pipeline.surface.shots import Shots
+from pipeline.surface.sides import SIDES, Sides
+from pipeline.surface.volumes import Volumes
 
 Columns = dict[str, np.ndarray]
 
@@ -35,6 +37,42 @@ def columns_of_as_built(built: AsBuilt, null_int: int) -> Columns:
 def columns_of_stations(stations: Stations) -> Columns:
     """Columns of the ``stations`` table."""
     return {name: getattr(stations, name) for name in Stations.__dataclass_fields__}
+
+
+def columns_of_sides(sides: Sides, judged: SideVerdicts | None) -> Columns:
+    """Columns of the ``sides`` table: station by station, left before right; without a tolerance nothing is judged."""
+    shape = sides.outward.shape
+    said = {
+        "expanded_uncertainty": np.full(shape, np.nan) if judged is None else judged.expanded_uncertainty,
+        "verdict": np.full(shape, "", object) if judged is None else judged.verdict,
+        "reason": np.full(shape, "", object) if judged is None else judged.reason,
+    }
+    found = {
+        name: getattr(sides, name)
+        for name in ("outward", "sigma_own", "sigma_common", "slope", "sigma_slope")
+    }
+    return {
+        "station": np.repeat(sides.station, 2),
+        "side": np.tile(np.array(SIDES, object), len(sides.station)),
+        **{name: values.ravel() for name, values in (found | said).items()},
+    }
+
+
+def columns_of_volumes(volumes: Volumes) -> Columns:
+    """Columns of the ``volumes`` table: cut, left and over-dug of each station."""
+    rows = [
+        (station, volume)
+        for station, of_station in zip(volumes.station, volumes.of_station)
+        for volume in of_station
+    ]
+    return {
+        "station": np.array([station for station, _ in rows], float),
+        "kind": np.array([volume.kind for _, volume in rows], object),
+        "volume": np.array([volume.m3 for _, volume in rows], float),
+        "sigma_own": np.array([volume.sigma_own_m3 for _, volume in rows], float),
+        "sigma_common": np.array([volume.sigma_common_m3 for _, volume in rows], float),
+        "area": np.array([volume.area_m2 for _, volume in rows], float),
+    }
 
 
 def columns_of_checks(shots: Shots, comparison: Comparison) -> Columns:

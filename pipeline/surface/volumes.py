@@ -1,0 +1,365 @@
+"""Volumes between as-built, design and the ground before: cut, left to cut, over-dug; each with its sigma.
+
+Over-dug and left are sums of one-sided deviations, and the noise of a cell does not average out in them: a floor
+dug exactly to its design, seen with sigma 5 mm, shows 2 mm over-dug and 2 mm left everywhere. So the spread of the
+true deviations is found first (what the spread of the estimates exceeds their own noise by), and each cell gives
+the expectation of its one-sided deviation given its estimate, its noise and that spread:
+
+    d | estimate  ~  N(m, v)      m = mean + k (estimate - mean),   v = k own²,   k = spread² / (spread² + own²)
+    E max(d, 0)   =  m Phi(m / sqrt v) + sqrt v phi(m / sqrt v)
+
+The common error moves all cells alike: the sums are made again with all cells one common sigma higher and lower, and
+half the difference is the common part. The own part takes the cells of one sweep as sharing one error, as the
+stations do (`decision.py`).
+
+Cells are whole or nothing, and a side that runs along their borders would be wrong by half a cell all along: what the
+sides (`sides.py`) tell is added where they are told, and where they are not the rounding is in the sigma.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.surface.as_built import AsBuilt
+from pipeline.surface.design import Design
+from pipeline.surface.ground import Ground
+from pipeline.surface.sides import LOW_M, SideRows
+from pipeline.surface.sweep import sweeps_of
+
+CUT, LEFT, OVER = "cut", "left to cut", "over-dug"
+KINDS = (CUT, LEFT, OVER)
+FAR_SIDE_M = 20.0
+"""How far beside its floor a design is followed up to the ground where nothing was dug."""
+COARSE_M = 0.25
+"""Step along the alignment where nothing was dug: there the design and the ground alone make the volume."""
+
+
+@dataclass(frozen=True)
+class Volume:
+    """One volume."""
+
+    kind: str
+    m3: float
+    """nan where it cannot be told."""
+    sigma_own_m3: float
+    sigma_common_m3: float
+    area_m2: float
+    """Plan area of the cells that are in it."""
+
+    @property
+    def sigma_m3(self) -> float:
+        """Both parts together."""
+        return float(np.hypot(self.sigma_own_m3, self.sigma_common_m3))
+
+
+@dataclass(frozen=True)
+class Volumes:
+    """Volumes of the job and of each station's piece of it."""
+
+    job: tuple[Volume, ...]
+    """Cut, left to cut, over-dug."""
+    station: np.ndarray
+    """(n,) metres."""
+    of_station: tuple[tuple[Volume, ...], ...]
+    """The same three for each station."""
+    not_reached_m3: float
+    """Part of the job's left to cut that lies where no cell was cut; nan without a ground."""
+    uncut_m2: float
+    """Plan area of the designed floor in the visited stretch where no cell was cut."""
+
+
+def volumes(
+    built: AsBuilt,
+    design: Design,
+    ground: Ground | None,
+    side_rows: SideRows,
+    station: np.ndarray,
+    step_m: float,
+) -> Volumes:
+    """Volumes of the trench.
+
+    Left to cut is, on cells that were cut, what stands above the design; on the others all soil between the design
+    and the ground (or the lowest pass over the cell, whichever is lower), which only a known ground tells. Cut is
+    what lay between the ground and the as-built surface, floor and sides.
+
+    Parameters
+    ----------
+    built : AsBuilt
+        The surface.
+    design : Design
+        What was to be dug.
+    ground : Ground or None
+        As it was before; without it cut is nan, and left counts cut cells alone.
+    side_rows : SideRows
+        The sides of the floor in each row of cells.
+    station : (n,) array
+        Metres, ascending: each stands for half a step to either side.
+    step_m : float
+        Their distance.
+
+    Returns
+    -------
+    Volumes
+    """
+    grid = built.grid
+    area = grid.cell_m**2
+    spread = _spread(built)
+    along, across = np.meshgrid(grid.station, grid.offset, indexing="ij")
+    ground_h = np.full(built.h.shape, np.nan) if ground is None else ground.elevation(along, across)
+    untouched = _untouched(built, ground_h)
+    sigma_ground = 0.0 if ground is None else ground.sigma_m
+
+    strips = _strips(built, ground_h, side_rows)
+
+    def over_rows(rows: slice) -> tuple[Volume, ...]:
+        cut = built.cut[rows]
+        dug = cut & np.isfinite(built.design_h[rows])
+        when = built.lowest_time_ns[rows]
+        own, common = built.sigma_own[rows], built.sigma_common[rows]
+        deviation = built.deviation[rows]
+        over = _one_sided(-deviation[dug], own[dug], common[dug], when[dug], spread.mirrored)
+        high = _one_sided(deviation[dug], own[dug], common[dug], when[dug], spread)
+        low_cells, high_cells = (np.count_nonzero(part) for part in (deviation[dug] < 0, deviation[dug] > 0))
+        over_dug = Volume(OVER, over[0] * area, over[1] * area, over[2] * area, low_cells * area)
+        if ground is None:
+            nothing = Volume(CUT, np.nan, np.nan, np.nan, 0.0)
+            return (
+                nothing,
+                Volume(LEFT, high[0] * area, high[1] * area, high[2] * area, high_cells * area),
+                over_dug,
+            )
+        known = cut & np.isfinite(ground_h[rows])
+        depth = np.maximum(ground_h[rows] - built.h[rows], 0.0)[known]
+        own_cut = np.sqrt(np.sum(sweeps_of(own[known], when[known]) ** 2)) * area
+        common_cut = np.hypot(common[known].sum(), sigma_ground * np.count_nonzero(known)) * area
+        soil = untouched[rows]
+        of_ground = sigma_ground * np.count_nonzero(soil) * area
+        edge = strips.over(rows)
+        left = (high[0] + float(soil.sum())) * area + edge.left_m3
+        return (
+            Volume(
+                CUT,
+                float(depth.sum()) * area + edge.cut_m3,
+                float(np.hypot(own_cut, edge.sigma_own_m3)),
+                float(np.hypot(common_cut, edge.sigma_common_m3)),
+                np.count_nonzero(known) * area,
+            ),
+            Volume(
+                LEFT,
+                left,
+                float(np.hypot(high[1] * area, edge.sigma_own_m3)),
+                float(np.sqrt((high[2] * area) ** 2 + of_ground**2 + edge.sigma_common_m3**2)),
+                (high_cells + np.count_nonzero(soil)) * area,
+            ),
+            over_dug,
+        )
+
+    border = np.searchsorted(
+        grid.station, np.concatenate([station - 0.5 * step_m, station[-1:] + 0.5 * step_m])
+    )
+    of_station = tuple(over_rows(slice(border[i], border[i + 1])) for i in range(len(station)))
+    job = over_rows(slice(0, grid.rows))
+    elsewhere = 0.0
+    if ground is not None:
+        elsewhere, plan = _undug(built, design, ground)
+        left = job[1]
+        job = (
+            job[0],
+            Volume(
+                LEFT,
+                left.m3 + elsewhere,
+                left.sigma_own_m3,
+                left.sigma_common_m3 + sigma_ground * plan,
+                left.area_m2 + plan,
+            ),
+            job[2],
+        )
+    floor = built.floor & np.isfinite(built.design_h)
+    return Volumes(
+        job=job,
+        station=station,
+        of_station=of_station,
+        not_reached_m3=elsewhere + float(untouched.sum()) * area if ground is not None else np.nan,
+        uncut_m2=np.count_nonzero(floor & ~built.cut) * area,
+    )
+
+
+@dataclass(frozen=True)
+class _Edge:
+    """What the border of the cut adds to the cells, m³."""
+
+    cut_m3: float
+    left_m3: float
+    sigma_own_m3: float
+    sigma_common_m3: float
+
+
+@dataclass(frozen=True)
+class _Strips:
+    """Strips between the outermost cut cell of each row and the side that the passes told; arrays (rows, 2)."""
+
+    cut_m3: np.ndarray
+    left_m3: np.ndarray
+    own_m3: np.ndarray
+    common_m3: np.ndarray
+    """Signed: an error across the alignment adds to one side what it takes from the other."""
+    rounding_m3: np.ndarray
+    """Where the side is not told: the rounding to whole cells, the same in neighbouring rows."""
+    time_ns: np.ndarray
+    end_m3: np.ndarray
+    """(rows,) rounding of the first and the last row that is cut, along the alignment; 0 elsewhere."""
+
+    def over(self, rows: slice) -> _Edge:
+        own = self.own_m3[rows]
+        told = own > 0
+        of_sides = np.sum(sweeps_of(own[told], self.time_ns[rows][told]) ** 2)
+        common = [abs(float(self.common_m3[rows].sum())), *self.rounding_m3[rows].sum(axis=0)]
+        return _Edge(
+            float(self.cut_m3[rows].sum()),
+            float(self.left_m3[rows].sum()),
+            float(np.sqrt(of_sides + np.sum(self.end_m3[rows] ** 2))),
+            float(np.sqrt(np.sum(np.square(common)))),
+        )
+
+
+def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
+    grid = built.grid
+    cell = grid.cell_m
+    shape = (grid.rows, 2)
+    cut_m3, left_m3, own, common, rounding = (np.zeros(shape) for _ in range(5))
+    level = np.where(built.floor, built.design_h, np.nan)
+    depth_m = np.where(built.cut, ground_h - built.h, np.nan)
+    rounded = cell / np.sqrt(12.0)
+    for side, sign in ((0, -1.0), (1, 1.0)):
+        outward = sign * grid.offset
+        # The floor's own cells and those that lie no higher than it: up a slope cells end where the slope does.
+        low = built.cut & (
+            built.h < np.nanmax(np.where(built.floor, level, -np.inf), axis=1)[:, None] + LOW_M
+        )
+        low &= (outward > 0)[None, :]
+        reach = np.where(low, outward[None, :], -np.inf)
+        last = np.argmax(reach, axis=1)
+        rows = np.flatnonzero(low.any(axis=1))
+        depth = depth_m[rows, last[rows]]
+        rows, depth = rows[np.isfinite(depth)], depth[np.isfinite(depth)]
+        counted = outward[last[rows]] + 0.5 * cell
+        reached = sides.border[rows, side] + sides.outward[rows, side]
+        told = np.abs(reached - counted) <= 2 * cell
+        strip = np.where(told, reached - counted, 0.0)
+        cut_m3[rows, side] = strip * cell * depth
+        # What is cut there is no longer left; outside the floor only a designed slope leaves soil to cut.
+        border = sides.border[rows, side]
+        within = np.minimum(counted + strip, border) - np.minimum(counted, border)
+        sloped = np.isfinite(built.design_h[rows, np.argmax(outward[None, :] > border[:, None], axis=1)])
+        left_m3[rows, side] = -(within + np.where(sloped, strip - within, 0.0)) * cell * depth
+        own[rows, side] = np.where(told, sides.own[rows, side], 0.0) * cell * depth
+        common[rows, side] = np.where(told, sign * sides.common[rows, side], 0.0) * cell * depth
+        rounding[rows, side] = np.where(told, 0.0, rounded) * cell * depth
+    end = np.zeros(grid.rows)
+    filled = np.flatnonzero(np.isfinite(depth_m).any(axis=1))
+    if len(filled):
+        along = np.hypot(rounded, np.nanmedian(sides.common) if np.isfinite(sides.common).any() else 0.0)
+        for row in (filled[0], filled[-1]):
+            end[row] = along * cell * float(np.nansum(np.maximum(depth_m[row], 0.0)))
+    return _Strips(cut_m3, left_m3, own, common, rounding, sides.time_ns, end)
+
+
+@dataclass(frozen=True)
+class _Spread:
+    """Mean and spread of the true deviations of a job's cells, metres."""
+
+    mean: float
+    variance: float
+    sigma_mean: float
+    """Own standard deviation of the mean."""
+
+    @property
+    def mirrored(self) -> _Spread:
+        return _Spread(-self.mean, self.variance, self.sigma_mean)
+
+    def moved(self, by_m: float) -> _Spread:
+        return _Spread(self.mean + by_m, self.variance, self.sigma_mean)
+
+
+def _spread(built: AsBuilt) -> _Spread:
+    """How the true deviations scatter: what the estimates scatter more than their own noise, at least nothing."""
+    dug = built.cut & np.isfinite(built.design_h)
+    if not np.any(dug):
+        return _Spread(0.0, 0.0, 0.0)
+    deviation, own = built.deviation[dug], built.sigma_own[dug]
+    sweeps = sweeps_of(own, built.lowest_time_ns[dug])
+    return _Spread(
+        mean=float(deviation.mean()),
+        variance=max(float(deviation.var() - np.mean(own**2)), 0.0),
+        sigma_mean=float(np.sqrt(np.sum(sweeps**2))) / len(own),
+    )
+
+
+def _one_sided(
+    deviation: np.ndarray, own: np.ndarray, common: np.ndarray, when: np.ndarray, spread: _Spread
+) -> tuple[float, float, float]:
+    """Sum over cells of the positive part of their true deviations, with its own and its common sigma; metres."""
+    if not len(deviation):
+        return 0.0, 0.0, 0.0
+
+    def total(cells_m: np.ndarray | float, mean_m: float) -> float:
+        return float(_positive_part(deviation + cells_m, own, spread.moved(mean_m))[0].sum())
+
+    value, sd = _positive_part(deviation, own, spread)
+    of_cells = float(np.sqrt(np.sum(sweeps_of(sd, when) ** 2)))
+    of_mean = 0.5 * (total(0.0, spread.sigma_mean) - total(0.0, -spread.sigma_mean))
+    shift = float(common.mean())
+    of_common = 0.5 * (total(common, shift) - total(-common, -shift))
+    return float(value.sum()), float(np.hypot(of_cells, of_mean)), of_common
+
+
+def _positive_part(deviation: np.ndarray, own: np.ndarray, spread: _Spread) -> tuple[np.ndarray, np.ndarray]:
+    """Expectation and standard deviation of max(d, 0) for d given its estimate; (n,) each."""
+    from scipy.special import ndtr
+
+    gain = spread.variance / np.maximum(spread.variance + own**2, 1e-18)
+    m = spread.mean + gain * (deviation - spread.mean)
+    sd = np.sqrt(np.maximum(gain, 0.0)) * own
+    u = m / np.maximum(sd, 1e-12)
+    above, density = ndtr(u), np.exp(-0.5 * np.minimum(u * u, 1000.0)) / np.sqrt(2 * np.pi)
+    mean = m * above + sd * density
+    square = (m * m + sd * sd) * above + m * sd * density
+    return mean, np.sqrt(np.maximum(square - mean * mean, 0.0))
+
+
+def _untouched(built: AsBuilt, ground_h: np.ndarray) -> np.ndarray:
+    """(rows, columns) height of the soil that still stands on the design where no cell was cut, metres."""
+    # Beside the floor a high pass that grazes a cell's centre would take its whole column away: all along a side at
+    # once, where the side runs along the cells' borders.
+    top = np.fmin(ground_h, np.where((built.state == 1) & built.floor, built.h_lowest, np.nan))
+    standing = np.where(built.cut | np.isnan(ground_h), 0.0, top - built.design_h)
+    return np.where(np.isfinite(standing), np.maximum(standing, 0.0), 0.0)
+
+
+def _undug(built: AsBuilt, design: Design, ground: Ground) -> tuple[float, float]:
+    """Volume and plan area between design and ground outside the cells of the as-built surface."""
+    grid = built.grid
+    first, last = design.station_range()
+    reach = min(design.floor_reach(), 50.0) + FAR_SIDE_M
+    offset = np.arange(-reach + 0.5 * grid.cell_m, reach, grid.cell_m)
+    low, high = grid.first_station, grid.first_station + grid.rows * grid.cell_m
+    beside = (offset < grid.first_offset) | (offset > grid.first_offset + grid.columns * grid.cell_m)
+    total = plan = 0.0
+    for begin, end, columns in (
+        (first, min(low, last), np.ones(len(offset), bool)),
+        (max(high, first), last, np.ones(len(offset), bool)),
+        (max(low, first), min(high, last), beside),
+    ):
+        pieces = int(np.ceil((end - begin) / COARSE_M)) if end > begin else 0
+        if not pieces or not columns.any():
+            continue
+        length = (end - begin) / pieces
+        station = begin + (np.arange(pieces) + 0.5) * length
+        along, across = np.meshgrid(station, offset[columns], indexing="ij")
+        soil = ground.elevation(along, across) - design.elevation(along, across)
+        soil = np.where(np.isfinite(soil), np.maximum(soil, 0.0), 0.0)
+        total += float(soil.sum()) * length * grid.cell_m
+        plan += float(np.count_nonzero(soil)) * length * grid.cell_m
+    return total, plan
