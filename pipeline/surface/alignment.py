@@ -1,4 +1,4 @@
-"""Station and offset along an alignment of straight lines and arcs, there and back; grid metres.
+"""Station and offset along an alignment of straight lines, arcs and spirals, there and back; grid metres.
 
 Stations run along the alignment from its start station; offsets are to the right of it, positive to the right when
 looking along increasing station. Before the first and after the last point the end tangents go on, so that a point
@@ -7,15 +7,21 @@ out there has a station outside ``[start, end]`` and can be told from one inside
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from pipeline.errors import SurfaceError
+from pipeline.surface.clothoid import Clothoid, clothoid_to
 
 # Consecutive points of a sweep lie together: one bounding circle rules out most elements for a chunk.
 _CHUNK = 4096
 _JOINT_TOLERANCE_M = 0.005
+_KINK_RAD = 0.02
+"""At a spiral's ends; rounded coordinates bend it by 0.001. More is a turn the wrong way, or radii in wrong order."""
+_END_M = 1e-8
 
 
 @dataclass(frozen=True)
@@ -27,12 +33,14 @@ class Alignment:
     end: np.ndarray
     """(m, 2) of each element's end."""
     center: np.ndarray
-    """(m, 2) of the arc's centre; nan for a line."""
+    """(m, 2) of the arc's centre; nan for a line and for a spiral."""
     turn: np.ndarray
     """(m,) -1 turns left (counter-clockwise), +1 turns right (clockwise), 0 is a straight line."""
     station: np.ndarray
     """(m + 1,) stations of the elements' borders, metres."""
     name: str = ""
+    curvature: np.ndarray | None = None
+    """(m, 2) at the start and end of spirals, 1/m, positive to the right; nan for other elements. None: no spirals."""
 
     @property
     def start_station(self) -> float:
@@ -100,10 +108,10 @@ class Alignment:
         start, end, center = self.start[element], self.end[element], self.center[element]
         turn = self.turn[element].astype(float)
         length = np.diff(self.station)[element]
+        arc = (turn != 0) & np.isfinite(center[..., 0])
         line_direction = (end - start) / np.linalg.norm(end - start, axis=-1, keepdims=True)
         foot = start + along[..., None] * line_direction
         direction = line_direction
-        arc = turn != 0
         if np.any(arc):
             radial = start - center
             radius = np.linalg.norm(radial, axis=-1)
@@ -122,6 +130,11 @@ class Alignment:
             )
             foot = np.where(arc[..., None], center + turned, foot)
             direction = np.where(arc[..., None], tangent, direction)
+        for k, spiral in self._spirals.items():
+            here = element == k
+            if np.any(here):
+                point, direction[here] = spiral.walk(along[here])
+                foot[here] = self.start[k] + point
         assert length.shape == along.shape
         return foot, direction
 
@@ -162,6 +175,19 @@ class Alignment:
             offset[rows[out]] = (away[:, 0] * tangent[0, 1] - away[:, 1] * tangent[0, 0])[out]
         return station, offset
 
+    @cached_property
+    def _spirals(self) -> dict[int, Clothoid]:
+        if self.curvature is None:
+            return {}
+        return {
+            int(k): clothoid_to(
+                self.end[k] - self.start[k],
+                (-float(self.curvature[k, 0]), -float(self.curvature[k, 1])),
+                float(self.station[k + 1] - self.station[k]),
+            )
+            for k in np.flatnonzero(np.isfinite(self.curvature[:, 0]))
+        }
+
     def _circles(self) -> tuple[np.ndarray, np.ndarray]:
         length = np.diff(self.station)
         middle, _ = self._walk(np.arange(len(self.turn)), 0.5 * length)
@@ -173,7 +199,10 @@ class Alignment:
         length = float(self.station[k + 1] - self.station[k])
         first, last = k == 0, k == len(self.turn) - 1
         ends, tangents = self._walk(np.array([k, k]), np.array([0.0, length]))
-        if self.turn[k] == 0:
+        if spiral := self._spirals.get(k):
+            along = spiral.nearest(en - self.start[k])
+            along = np.where(along < _END_M, 0.0, np.where(along > length - _END_M, length, along))
+        elif self.turn[k] == 0:
             along = (en - ends[0]) @ tangents[0]
         else:
             radial = en - self.center[k]
@@ -193,6 +222,20 @@ class Alignment:
             corner = tangents[1] + self._tangent(k + 1, at_end=False)
             direction = np.where((along >= length)[:, None], corner, direction)
         return inside, foot, direction
+
+    def check_spirals(self) -> None:
+        """Raise SurfaceError where a spiral leaves its neighbour's direction."""
+        for k in self._spirals:
+            for before, after in ((k - 1, k), (k, k + 1)):
+                if before < 0 or after >= len(self.turn):
+                    continue
+                a, b = self._tangent(before, at_end=True), self._tangent(after, at_end=False)
+                kink = abs(float(np.arctan2(a[0] * b[1] - a[1] * b[0], a @ b)))
+                if kink > _KINK_RAD:
+                    raise SurfaceError(
+                        f"alignment '{self.name}': elements {before + 1} and {after + 1} meet at an angle of "
+                        f"{np.degrees(kink):.1f} degrees although one is a spiral; are its rot and radii right?"
+                    )
 
     def _tangent(self, k: int, at_end: bool) -> np.ndarray:
         along = float(self.station[k + 1] - self.station[k]) if at_end else 0.0
@@ -242,13 +285,15 @@ def from_elements(
     start_station_m: float,
     name: str,
     tolerance_m: float = _JOINT_TOLERANCE_M,
+    curvature: np.ndarray | None = None,
+    spiral_length: np.ndarray | None = None,
 ) -> Alignment:
-    """Alignment of lines and arcs given by their points.
+    """Alignment of lines, arcs and spirals given by their points.
 
     Parameters
     ----------
     start, end, center : (m, 2) arrays
-        Grid metres; center is nan for a line.
+        Grid metres; center is nan for a line and for a spiral.
     turn : (m,) array
         -1 left, +1 right, 0 line.
     start_station_m : float
@@ -256,12 +301,18 @@ def from_elements(
     name : str
         For messages.
     tolerance_m : float
-        How far an element may start from the end of the one before, and an arc's two radii may differ.
+        How far an element may start from the end of the one before, an arc's two radii may differ, and a spiral's
+        length may differ from what its ends and radii make it.
+    curvature : (m, 2) array, optional
+        At start and end of spirals, 1/m, positive to the right; nan for other elements.
+    spiral_length : (m,) array, optional
+        As stated, metres; nan for other elements.
 
     Raises
     ------
     SurfaceError
-        When elements do not join, an arc's end is not on its circle, or an element has no length.
+        When elements do not join, an arc's end is not on its circle, a spiral does not fit between its ends or
+        neighbours, or an element has no length.
     """
     start, end, center = (np.asarray(a, dtype=np.float64).reshape(-1, 2) for a in (start, end, center))
     turn = np.asarray(turn, dtype=np.int8)
@@ -273,7 +324,7 @@ def from_elements(
             "export it again as one chain"
         )
     chord = np.linalg.norm(end - start, axis=1)
-    arc = turn != 0
+    arc = (turn != 0) & np.isfinite(center[:, 0])
     radius = np.where(arc, np.linalg.norm(start - center, axis=1), np.nan)
     other = np.where(arc, np.linalg.norm(end - center, axis=1), np.nan)
     if np.any(np.abs(radius - other)[arc] > tolerance_m):
@@ -291,11 +342,35 @@ def from_elements(
     angle = np.mod(np.arctan2(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0], np.sum(a * b, axis=1)), 2 * np.pi)
     angle = np.where(turn > 0, 2 * np.pi - angle, angle)
     length = np.where(arc, radius * angle, chord)
-    return Alignment(
+    if curvature is not None and spiral_length is not None:
+        for k in np.flatnonzero(np.isfinite(curvature[:, 0])):
+            length[k] = _spiral_length(
+                end[k] - start[k], curvature[k], spiral_length[k], tolerance_m, f"alignment '{name}': spiral {k + 1}"
+            )
+    alignment = Alignment(
         start=start,
         end=end,
         center=center,
         turn=turn,
         station=start_station_m + np.concatenate([[0.0], np.cumsum(length)]),
         name=name,
+        curvature=curvature,
     )
+    alignment.check_spirals()
+    return alignment
+
+
+def _spiral_length(
+    chord: np.ndarray, curvature: Sequence[float], stated: float, tolerance_m: float, where: str
+) -> float:
+    """Length of the spiral over a chord (2,). Raises SurfaceError where it is not the stated one."""
+    k0, k1 = -float(curvature[0]), -float(curvature[1])
+    if not stated > 0 or max(abs(k0), abs(k1)) * stated > 2 * np.pi:
+        raise SurfaceError(f"{where} is {stated:g} m long and winds more than once with its radii; export it again")
+    fitted = clothoid_to(chord, (k0, k1), stated).length
+    if abs(fitted - stated) > tolerance_m:
+        raise SurfaceError(
+            f"{where} is stated as {stated:.3f} m long, but with its radii it takes {fitted:.3f} m from its start to "
+            "its end; export it again"
+        )
+    return fitted

@@ -1,31 +1,44 @@
-"""LandXML as it comes: surfaces and alignments in the unit of the file, read in one pass and within bounds.
+"""LandXML as it comes: surfaces, alignments, profiles and pipes in the unit of the file, read in one pass, in bounds.
 
 Versions 1.0 to 2.0 and Inframodel differ by namespace only, so elements are told by their local name. Points are
 northing, easting, elevation in the file and easting, northing, elevation from here on. A file from outside is
 hostile until shown otherwise: no DTD, no entities, bounded depth, size, counts and text (defusedxml, streaming).
+Each part of a file is heard by a `Section` of its own: ``landxml_surfaces`` ``landxml_alignments``
+``landxml_profiles`` ``landxml_pipes``.
 """
 
 from __future__ import annotations
 
-import math
-from array import array
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Protocol, TypeVar
 from xml.etree.ElementTree import ParseError
 
-import numpy as np
 from defusedxml import DefusedXmlException
 from defusedxml.ElementTree import DefusedXMLParser
 
+from pipeline.config.site import METRES_PER_UNIT
 from pipeline.errors import SurfaceError
+from pipeline.surface.landxml_alignments import AlignmentSection, XmlAlignment, XmlElement
+from pipeline.surface.landxml_pipes import METRES_PER_DIAMETER_UNIT, PipeSection, XmlPipe
+from pipeline.surface.landxml_profiles import XmlProfile, XmlVertex
+from pipeline.surface.landxml_section import PointSection, Section
+from pipeline.surface.landxml_surfaces import SurfaceSection, TinSurface
+
+__all__ = [
+    "LandXml",
+    "TinSurface",
+    "XmlAlignment",
+    "XmlElement",
+    "XmlPipe",
+    "XmlProfile",
+    "XmlVertex",
+    "profile_named",
+    "read_landxml",
+]
 
 MAX_BYTES = 500_000_000
 MAX_DEPTH = 64
-MAX_POINTS = 5_000_000
-MAX_FACES = 10_000_000
-MAX_TEXT = 10_000
-"""Characters of one element that we read; a point has under a hundred."""
 _READ = 1 << 18
 
 # LandXML's own words for units; "foot" is the international foot there.
@@ -37,44 +50,12 @@ _UNITS = {
 }
 
 
-@dataclass(frozen=True)
-class TinSurface:
-    """One triangulated surface."""
-
-    name: str
-    points: np.ndarray
-    """(n, 3) easting, northing, elevation, unit of the file."""
-    faces: np.ndarray
-    """(m, 3) int, visible faces only."""
-    invisible: int
-    """Faces that were skipped because the file says so (``i="1"``)."""
-    stated: dict[str, float] = field(default_factory=dict)
-    """What the file itself says: area2DSurf, area3DSurf, elevMin, elevMax, where given."""
+class _Named(Protocol):
+    @property
+    def name(self) -> str: ...
 
 
-@dataclass(frozen=True)
-class XmlElement:
-    """One element of an alignment's geometry."""
-
-    kind: str
-    """Line, Curve, or another name that the caller refuses."""
-    start: tuple[float, float]
-    """Easting, northing, unit of the file."""
-    end: tuple[float, float]
-    center: tuple[float, float] | None
-    clockwise: bool
-
-
-@dataclass(frozen=True)
-class XmlAlignment:
-    """One alignment's plan geometry."""
-
-    name: str
-    start_station: float
-    stated_length: float | None
-    elements: tuple[XmlElement, ...]
-    equations: int
-    """Station equations, which make stations jump."""
+_Item = TypeVar("_Item", bound=_Named)
 
 
 @dataclass(frozen=True)
@@ -87,6 +68,16 @@ class LandXml:
     unit_as_written: str
     surfaces: tuple[TinSurface, ...]
     alignments: tuple[XmlAlignment, ...]
+    placed_pipes: tuple[XmlPipe, ...] = ()
+    pipe_fault: str = ""
+    """Why the pipes cannot be used, one sentence; whoever wants only a surface need not care."""
+
+    @property
+    def pipes(self) -> tuple[XmlPipe, ...]:
+        """The pipes of all networks. Raises SurfaceError where one cannot be placed."""
+        if self.pipe_fault:
+            raise SurfaceError(self.pipe_fault)
+        return self.placed_pipes
 
     def surface(self, name: str | None) -> TinSurface:
         """The surface of that name, or the only one. Raises SurfaceError."""
@@ -97,8 +88,14 @@ class LandXml:
         return _pick(self.alignments, name, self.source, "alignment", "design.alignment")
 
 
+def profile_named(alignment: XmlAlignment, name: str, source: str) -> XmlProfile:
+    """The profile of that name along an alignment. Raises SurfaceError."""
+    where = f"{source}: alignment '{alignment.name}'"
+    return _pick(alignment.profiles, name, where, "profile", "design.profile")
+
+
 def read_landxml(path: Path) -> LandXml:
-    """Surfaces and alignments of a LandXML file.
+    """Surfaces, alignments with their profiles, and pipes of a LandXML file.
 
     Raises
     ------
@@ -135,7 +132,7 @@ def read_landxml(path: Path) -> LandXml:
     return reader.result()
 
 
-def _pick(found, name, source, noun, key):
+def _pick(found: tuple[_Item, ...], name: str | None, source: str, noun: str, key: str) -> _Item:
     if not found:
         raise SurfaceError(f"{source}: holds no {noun}; export one, or mend design.file in site.toml")
     names = [item.name for item in found]
@@ -160,32 +157,31 @@ def _listed(names: list[str]) -> str:
 
 
 class _Reader:
-    """Target of the parser: hears elements, keeps numbers."""
+    """Target of the parser: holds depth and text in bounds, and hands each part of the file to its section."""
 
     def __init__(self, source: str):
         self.source = source
-        self.unit_as_written = ""
-        self.surfaces: list[TinSurface] = []
-        self.alignments: list[XmlAlignment] = []
-        self._path: list[str] = []
-        self._skipped = 0  # depth below an element that does not concern us
-        self._text: list[str] | None = None
-        self._text_length = 0
-        self._attributes: dict[str, str] = {}
-        self._local: dict[str, str] = {}
-        self._new_surface("")
-        self._new_alignment({})
-        self._element: tuple[str, dict[str, str]] | None = None
-        self._vertices: dict[str, tuple[float, float]] = {}
-        self._starts: dict[str, Callable[[dict[str, str]], None]] = {
-            "Units": self._start_nothing,
-            "Metric": self._start_unit,
-            "Imperial": self._start_unit,
-            "Surface": self._start_surface,
-            "Definition": self._start_definition,
-            "Alignment": self._new_alignment,
-            "StaEquation": self._start_equation,
+        self._surfaces = SurfaceSection(source)
+        self._alignments = AlignmentSection(source)
+        self._pipes = PipeSection(source)
+        self._points = PointSection(source)
+        self._units = _UnitSection(source)
+        self._sections: dict[str, Section] = {
+            "Units": self._units,
+            "CgPoints": self._points,
+            "Surfaces": self._surfaces,
+            "Surface": self._surfaces,
+            "Alignments": self._alignments,
+            "Alignment": self._alignments,
+            "PipeNetworks": self._pipes,
         }
+        self._section: Section | None = None
+        self._section_depth = 0
+        self._path: list[str] = []
+        self._text: list[str] = []
+        self._text_depth = 0  # of the element whose text is wanted; 0 where none is
+        self._limit = self._left = 0  # characters that it may have, and may still have
+        self._local: dict[str, str] = {}
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         name = self._local.get(tag)
@@ -199,182 +195,81 @@ class _Reader:
             raise SurfaceError(
                 f"{self.source}: elements nested deeper than {MAX_DEPTH}; this is no sound LandXML"
             )
-        if name in ("P", "F"):
-            if len(path) >= 3 and path[-3] == "Definition":
-                self._attributes = attributes
-                self._text, self._text_length = [], 0
-        elif path[-2:-1] == ["CoordGeom"]:
-            if path[-3:-2] == ["Alignment"]:
-                self._element, self._vertices = (name, attributes), {}
-        elif name in ("Start", "End", "Center"):
-            if self._element is not None:
-                self._text, self._text_length = [], 0
-        elif handle := self._starts.get(name):
-            handle(attributes)
+        section = self._section
+        if section is None:
+            section = self._section = self._sections.get(name)
+            self._section_depth = len(path)
+            if section is None:
+                return
+        if limit := section.start(name, attributes, path):
+            self._limit = self._left = limit
+            self._text, self._text_depth = [], len(path)
 
     def data(self, text: str) -> None:
-        if self._text is not None:
+        # Elements inside, such as the features of a point, have texts of their own.
+        if self._text_depth == len(self._path):
             self._text.append(text)
-            self._text_length += len(text)
-            if self._text_length > MAX_TEXT:
+            self._left -= len(text)
+            if self._left < 0:
                 raise SurfaceError(
-                    f"{self.source}: a {self._path[-1]} element with more than {MAX_TEXT} characters"
+                    f"{self.source}: a {self._path[-1]} element with more than {self._limit} characters"
                 )
 
     def end(self, tag: str) -> None:
         name = self._path.pop()
-        if self._text is not None:
-            text = "".join(self._text)
-            self._text = None
-            if name == "P":
-                self._end_point(text)
-            elif name == "F":
-                self._end_face(text)
-            else:
-                numbers = self._numbers(text, 2, f"{name} of an alignment's element")
-                self._vertices[name] = (numbers[1], numbers[0])
-        elif name == "Surface":
-            self._end_surface()
-        elif name == "Alignment":
-            self._end_alignment()
-        elif self._path[-1:] == ["CoordGeom"] and self._element is not None:
-            self._end_element()
+        if self._section is None:
+            return
+        text = ""
+        if self._text_depth == len(self._path) + 1:
+            text, self._text_depth = "".join(self._text), 0
+        self._section.end(name, text, self._path)
+        if len(self._path) < self._section_depth:
+            self._section = None
 
     def close(self) -> None:
         pass
 
     def result(self) -> LandXml:
-        unit = _UNITS.get(self.unit_as_written.lower()) if self.unit_as_written else None
-        return LandXml(self.source, unit, self.unit_as_written, tuple(self.surfaces), tuple(self.alignments))
-
-    def _start_nothing(self, attributes: dict[str, str]) -> None:
-        pass
-
-    def _start_unit(self, attributes: dict[str, str]) -> None:
-        if self._path[-2] == "Units":
-            self.unit_as_written = attributes.get("linearUnit", "")
-            heights = attributes.get("elevationUnit")
-            feet = self._path[-1] == "Imperial" and heights == "feet"  # LandXML's only word for either foot
-            if heights and heights != self.unit_as_written and not feet:
-                raise SurfaceError(
-                    f"{self.source}: linearUnit is '{self.unit_as_written}' but elevationUnit is '{heights}'; "
-                    "export it with one unit"
-                )
-
-    def _new_surface(self, name: str) -> None:
-        self._surface_name = name
-        self._surface_kind = ""
-        self._stated: dict[str, float] = {}
-        self._coordinates = array("d")
-        self._index_of: dict[str, int] = {}
-        self._corners: list[str] = []
-        self._invisible = 0
-
-    def _start_surface(self, attributes: dict[str, str]) -> None:
-        self._new_surface(attributes.get("name", ""))
-
-    def _start_definition(self, attributes: dict[str, str]) -> None:
-        self._surface_kind = attributes.get("surfType", "")
-        for key in ("area2DSurf", "area3DSurf", "elevMin", "elevMax"):
-            if key in attributes:
-                self._stated[key] = self._numbers(
-                    attributes[key], 1, f"{key} of surface '{self._surface_name}'"
-                )[0]
-
-    def _end_point(self, text: str) -> None:
-        identity = self._attributes.get("id", "")
-        n, e, h = self._numbers(text, 3, f"point {identity} of surface '{self._surface_name}'")[:3]
-        if identity in self._index_of:
-            raise SurfaceError(
-                f"{self.source}: surface '{self._surface_name}' has two points with id {identity}"
-            )
-        if len(self._index_of) >= MAX_POINTS:
-            raise SurfaceError(
-                f"{self.source}: a surface of more than {MAX_POINTS} points; cut it down to the job"
-            )
-        self._index_of[identity] = len(self._index_of)
-        self._coordinates.extend((e, n, h))
-
-    def _end_face(self, text: str) -> None:
-        if self._attributes.get("i") == "1":
-            self._invisible += 1
-            return
-        corners = text.split()
-        if len(corners) == 3:
-            self._corners += corners
-        elif len(corners) == 4:  # faces of a grid surface
-            self._corners += [*corners[:3], corners[0], *corners[2:]]
-        else:
-            raise SurfaceError(
-                f"{self.source}: a face of surface '{self._surface_name}' has {len(corners)} corners, expected 3"
-            )
-        if len(self._corners) > 3 * MAX_FACES:
-            raise SurfaceError(
-                f"{self.source}: a surface of more than {MAX_FACES} faces; cut it down to the job"
-            )
-
-    def _end_surface(self) -> None:
-        if self._index_of and self._corners:
-            try:
-                faces = np.array([self._index_of[corner] for corner in self._corners]).reshape(-1, 3)
-            except KeyError as error:
-                raise SurfaceError(
-                    f"{self.source}: a face of surface '{self._surface_name}' names point {error}, which it has not"
-                ) from None
-            points = np.array(self._coordinates).reshape(-1, 3)
-            self.surfaces.append(TinSurface(self._surface_name, points, faces, self._invisible, self._stated))
-        self._new_surface("")
-
-    def _new_alignment(self, attributes: dict[str, str]) -> None:
-        self._alignment = attributes
-        self._elements: list[XmlElement] = []
-        self._equations = 0
-
-    def _start_equation(self, attributes: dict[str, str]) -> None:
-        self._equations += 1
-
-    def _end_element(self) -> None:
-        assert self._element is not None
-        kind, attributes = self._element
-        vertices, self._element = self._vertices, None
-        if "Start" not in vertices or "End" not in vertices:
-            raise SurfaceError(
-                f"{self.source}: a {kind} of alignment '{self._alignment.get('name', '')}' has no Start or no End "
-                "written as coordinates; export it with coordinates instead of point references"
-            )
-        self._elements.append(
-            XmlElement(
-                kind,
-                vertices["Start"],
-                vertices["End"],
-                vertices.get("Center"),
-                attributes.get("rot", "").lower() == "cw",
-            )
+        written = self._units.linear
+        unit = _UNITS.get(written.lower()) if written else None
+        diameter = METRES_PER_DIAMETER_UNIT.get(self._units.diameter.lower())
+        scale = diameter / METRES_PER_UNIT[unit] if diameter and unit else None
+        pipes, fault = (), ""
+        try:
+            pipes = self._pipes.pipes(self._points, scale)
+        except SurfaceError as error:
+            fault = str(error)
+        return LandXml(
+            self.source,
+            unit,
+            written,
+            tuple(self._surfaces.surfaces),
+            self._alignments.alignments(self._points),
+            pipes,
+            fault,
         )
 
-    def _end_alignment(self) -> None:
-        name = self._alignment.get("name", "")
-        if self._elements:
-            where = f"alignment '{name}'"
-            length = self._alignment.get("length")
-            self.alignments.append(
-                XmlAlignment(
-                    name,
-                    self._numbers(self._alignment.get("staStart", "0"), 1, f"staStart of {where}")[0],
-                    self._numbers(length, 1, f"length of {where}")[0] if length else None,
-                    tuple(self._elements),
-                    self._equations,
-                )
-            )
-        self._new_alignment({})
 
-    def _numbers(self, text: str, least: int, where: str) -> list[float]:
-        try:
-            numbers = [float(word) for word in text.split()]
-        except ValueError:
-            numbers = []
-        if len(numbers) < least or not all(map(math.isfinite, numbers)):
-            raise SurfaceError(
-                f"{self.source}: {where}: expected {least} numbers, found '{text.strip()[:60]}'"
-            )
-        return numbers
+class _UnitSection(Section):
+    """Units: what lengths and diameters are in."""
+
+    def __init__(self, source: str):
+        super().__init__(source)
+        self.linear = ""
+        self.diameter = ""
+
+    def start(self, name: str, attributes: dict[str, str], path: list[str]) -> int:
+        if name in ("Metric", "Imperial"):
+            self.linear = attributes.get("linearUnit", "")
+            self.diameter = attributes.get("diameterUnit", "")
+            heights = attributes.get("elevationUnit")
+            feet = name == "Imperial" and heights == "feet"  # LandXML's only word for either foot
+            if heights and heights != self.linear and not feet:
+                raise SurfaceError(
+                    f"{self.source}: linearUnit is '{self.linear}' but elevationUnit is '{heights}'; "
+                    "export it with one unit"
+                )
+        return 0
+
+    def end(self, name: str, text: str, path: list[str]) -> None:
+        pass

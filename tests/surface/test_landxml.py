@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SurfaceError
-from pipeline.surface import landxml
+from pipeline.surface import landxml, landxml_surfaces
 from pipeline.surface.landxml import read_landxml
 
 HEAD = '<?xml version="1.0"?>\n<LandXML xmlns="http://www.landxml.org/schema/LandXML-1.2" version="1.2">'
@@ -123,9 +123,13 @@ def test_what_makes_no_sense_or_may_be_hostile_is_refused_in_one_sentence(tmp_pa
 
 def test_bounds_on_size_and_counts(tmp_path, monkeypatch):
     path = written(tmp_path, METRES + SURFACE)
-    for bound, sentence in (("MAX_POINTS", "points"), ("MAX_FACES", "faces"), ("MAX_BYTES", "are read")):
+    for module, bound, sentence in (
+        (landxml_surfaces, "MAX_POINTS", "points"),
+        (landxml_surfaces, "MAX_FACES", "faces"),
+        (landxml, "MAX_BYTES", "are read"),
+    ):
         with monkeypatch.context() as patch:
-            patch.setattr(landxml, bound, 1)
+            patch.setattr(module, bound, 1)
             with pytest.raises(SurfaceError, match=sentence):
                 read_landxml(path)
 

@@ -1,0 +1,70 @@
+"""From the elements of a file, LandXML or DXF, to an alignment in grid metres; what cannot be followed is refused."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.errors import SurfaceError
+from pipeline.surface.alignment import Alignment, from_elements
+from pipeline.surface.landxml_alignments import XmlAlignment, XmlElement
+
+_LENGTH_M = 0.05
+"""How far the stated length of an alignment may be from that of its elements; rounding adds up over many of them."""
+
+
+def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
+    """The alignment of a file in grid metres. Raises SurfaceError for what cannot be followed.
+
+    Station equations are refused: with them one station can be two places, and a table by station would name neither.
+    """
+    where = f"{source}: alignment '{element.name}'"
+    foreign = sorted({e.kind for e in element.elements} - {"Line", "Curve", "Spiral"})
+    if foreign:
+        raise SurfaceError(
+            f"{where} has elements of kind {', '.join(foreign)}; lines, arcs and spirals are understood: "
+            "export it with them, or give [alignment] points in site.toml"
+        )
+    spirals = sorted({e.spiral or "of no kind" for e in element.elements if e.kind == "Spiral"} - {"clothoid"})
+    if spirals:
+        raise SurfaceError(
+            f"{where} has spirals that are {', '.join(spirals)}; clothoids are understood: export it with them, or as "
+            "a polyline"
+        )
+    if element.equations:
+        raise SurfaceError(
+            f"{where} has station equations, so its stations jump; export it with continuous stations"
+        )
+    if any(e.kind == "Curve" and e.center is None for e in element.elements):
+        raise SurfaceError(f"{where} has an arc without Center; export it with centres")
+    if any(e.kind == "Spiral" and e.length is None for e in element.elements):
+        raise SurfaceError(f"{where} has a spiral without length; export it again")
+    nowhere = (np.nan, np.nan)
+    spiral = any(e.kind == "Spiral" for e in element.elements)
+    alignment = from_elements(
+        np.array([e.start for e in element.elements]) * scale,
+        np.array([e.end for e in element.elements]) * scale,
+        np.array([e.center if e.kind == "Curve" and e.center else nowhere for e in element.elements]) * scale,
+        np.array([_turn(e) for e in element.elements]),
+        element.start_station * scale,
+        f"{element.name}",
+        curvature=np.array([_curvature(e) for e in element.elements]) / scale if spiral else None,
+        spiral_length=np.array([np.nan if e.length is None else e.length * scale for e in element.elements]),
+    )
+    if element.stated_length is not None and abs(alignment.length - element.stated_length * scale) > _LENGTH_M:
+        raise SurfaceError(
+            f"{where}: its elements are {alignment.length / scale:.3f} long, the file says "
+            f"{element.stated_length:.3f}; export it again"
+        )
+    return alignment
+
+
+def _turn(element: XmlElement) -> int:
+    return 0 if element.kind == "Line" else (1 if element.clockwise else -1)
+
+
+def _curvature(element: XmlElement) -> tuple[float, float]:
+    """At start and end, positive to the right, 1 / unit of the file; nan unless a spiral."""
+    if element.kind != "Spiral" or element.radii is None:
+        return np.nan, np.nan
+    sign = _turn(element)
+    return sign / element.radii[0], sign / element.radii[1]
