@@ -124,14 +124,71 @@ class Alignment(Section):
     """Station of the first point, grid unit."""
 
 
+DESIGN_KEYS = (
+    "surface", "alignment", "profile", "pipes", "pipe_run", "bedding", "width", "side_slope", "layer",
+    "alignment_layer", "start_station", "unit",
+)  # fmt: skip
+"""Which of them a design has tells what it is."""
+
+
 class Design(Section):
     file: str
     """Beside site.toml (or beside the log, when site.toml came as an attachment)."""
-    kind: Literal["profile_csv", "landxml"]
+    kind: Literal["profile_csv", "landxml", "dxf"]
     surface: str | None = None
     """LandXML: name of the surface; may be left out if there is only one."""
     alignment: str | None = None
     """LandXML: name of the alignment; may be left out if [alignment] stands in this file."""
+    profile: str | None = None
+    """LandXML: name of a profile of `alignment`, whose levels are those of the trench floor; instead of a surface."""
+    pipes: str | None = None
+    """LandXML: name of a pipe network; the floor lies `bedding` under its inverts; instead of a surface."""
+    pipe_run: tuple[str, ...] = ()
+    """Names of the pipes that are dug for; left out, all of the network, which must then be one line."""
+    bedding: NonNegative | None = None
+    """From the inverts down to the trench floor (wall of the pipe and bedding), grid unit."""
+    width: Positive | None = None
+    """With `profile` or `pipes`: width of the trench floor, grid unit."""
+    side_slope: NonNegative | None = None
+    """With `profile` or `pipes`: run per rise of both sides; left out, vertical walls."""
+    layer: str | None = None
+    """DXF: layer of the faces."""
+    alignment_layer: str | None = None
+    """DXF: layer of the alignment; may be left out if [alignment] stands in this file."""
+    start_station: float | None = None
+    """Station at which the line of `alignment_layer`, or of `pipes` without `alignment`, begins, grid unit; else 0."""
+    unit: Literal["m", "international_foot", "us_survey_foot"] | None = None
+    """DXF: the unit it is drawn in, for drawings that do not say; it must be that of the grid."""
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Design:
+        what, needed, allowed = self._keys()
+        given = {name for name in DESIGN_KEYS if getattr(self, name) not in (None, ())}
+        missing = [name for name in needed if name not in given]
+        if missing:
+            raise ValueError(f"a design that is {what} needs {' and '.join(missing)}")
+        foreign = sorted(given - set(needed) - set(allowed))
+        if foreign:
+            raise ValueError(f"a design that is {what} has no use for {', '.join(foreign)}: remove it")
+        return self
+
+    def _keys(self) -> tuple[str, tuple[str, ...], tuple[str, ...]]:
+        """What the design is, in words; the keys it needs, and those it may have besides."""
+        if self.kind == "profile_csv":
+            return "a CSV profile", (), ()
+        if self.kind == "dxf":
+            return "a DXF drawing", ("layer",), ("alignment_layer", "start_station", "unit")
+        if self.profile is not None:
+            return "a LandXML profile", ("profile", "alignment", "width"), ("side_slope",)
+        if self.pipes is not None:
+            start = () if self.alignment else ("start_station",)
+            return "a run of LandXML pipes", ("pipes", "bedding", "width"), ("pipe_run", "side_slope", "alignment", *start)
+        return "a LandXML surface", (), ("surface", "alignment")
+
+    @property
+    def brings_alignment(self) -> bool:
+        """Whether stations can run along a line of the design's own file."""
+        return bool(self.alignment or self.pipes or self.alignment_layer)
 
 
 class Ground(Section):
@@ -267,10 +324,18 @@ class Site(Section):
 
     @model_validator(mode="after")
     def _whole(self) -> Site:
-        if self.alignment is None and not (self.design.kind == "landxml" and self.design.alignment):
+        if self.alignment is None and not self.design.brings_alignment:
             raise ValueError(
-                "stations need an alignment: give [alignment] points, or design.alignment of a LandXML file"
+                "stations need an alignment: give [alignment] points, design.alignment of a LandXML file, or "
+                "design.alignment_layer of a drawing"
             )
+        if self.alignment is not None:
+            for key in ("profile", "alignment_layer", "start_station"):
+                if getattr(self.design, key) is not None:
+                    raise ValueError(
+                        f"design.{key} goes with an alignment of the design's own file, but [alignment] points are "
+                        "given: remove one of them"
+                    )
         owner: dict[tuple[str, int], str] = {}
         for name, mark in self.benchmarks.items():
             for tag in mark.tags:

@@ -365,8 +365,10 @@ def _spiral_length(
 ) -> float:
     """Length of the spiral over a chord (2,). Raises SurfaceError where it is not the stated one."""
     k0, k1 = -float(curvature[0]), -float(curvature[1])
-    if not stated > 0 or max(abs(k0), abs(k1)) * stated > 2 * np.pi:
-        raise SurfaceError(f"{where} is {stated:g} m long and winds more than once with its radii; export it again")
+    if not stated > 0:
+        raise SurfaceError(f"{where} has no length; remove it")
+    if max(abs(k0), abs(k1)) * stated > np.pi:  # beyond that the distance of its ends no longer tells its length
+        raise SurfaceError(f"{where} turns by more than half a circle with its radii; are they right?")
     fitted = clothoid_to(chord, (k0, k1), stated).length
     if abs(fitted - stated) > tolerance_m:
         raise SurfaceError(

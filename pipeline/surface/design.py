@@ -1,6 +1,7 @@
-"""The trench as designed: elevation and floor over station and offset, from a CSV profile or a LandXML surface.
+"""The trench as designed: elevation and floor over station and offset, from whatever file it comes in.
 
-What the **floor** is: for a profile, everything within half the floor width of the alignment. A triangulated surface
+What the **floor** is: for a profile or a run of pipes, everything within half the floor width of the alignment. A
+triangulated surface
 does not say; there the floor is made of the faces no steeper than `FLOOR_SLOPE` that hang together, edge by edge,
 with such faces under the alignment. Walls, slopes and the ground beside the trench, which flat faces
 cannot reach across a wall, are thereby left out. Where no face under the alignment is that flat (a ditch in the
@@ -9,8 +10,6 @@ shape of a V), the whole surface counts as floor, and the report says so.
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -20,16 +19,19 @@ import shapely
 
 from pipeline.config.site import METRES_PER_UNIT, Site
 from pipeline.errors import SurfaceError
-from pipeline.surface.alignment import Alignment, from_elements, polyline
-from pipeline.surface.landxml import LandXml, TinSurface, XmlAlignment, read_landxml
+from pipeline.surface.alignment import Alignment, polyline
+from pipeline.surface.dxf import Drawing, check_drawing_unit, read_dxf
+from pipeline.surface.landxml import LandXml, TinSurface, profile_named, read_landxml
+from pipeline.surface.long_profile import long_profile
+from pipeline.surface.pipe_run import run_of
+from pipeline.surface.plan_geometry import alignment_of
+from pipeline.surface.profile_csv import read_profile_rows
 
 FLOOR_SLOPE = 0.2
 """Rise per run. Pipes and trench floors stay under 0.1; the flattest side slopes that are cut are 0.25 (1 in 4)."""
 NEAR_M = 50_000.0
 """A design further than this from the world's origin belongs to another job, or has its axes or unit wrong."""
 NEAR_ELEVATION_M = 1_000.0
-PROFILE_COLUMNS = ("station", "elevation", "width", "side_slope")
-MAX_PROFILE_ROWS = 1_000_000
 _QUERY = 262_144
 
 
@@ -233,24 +235,20 @@ def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
     """
     scale = site.grid.metres_per_unit
     origin_m = site.grid.to_grid_metres(np.zeros(3))
-    landxml: LandXml | None = None
+    given: Alignment | None = None
+    if site.alignment is not None:
+        given = polyline(np.array(site.alignment.points) * scale, site.alignment.start_station * scale)
+        check_near(given.points(given.station, 0.0), origin_m[:2], site.grid.unit, "the alignment in site.toml")
+    design: Design
     if site.design.kind == "landxml":
         landxml = read_landxml(path)
         check_unit(landxml, site.grid.unit)
-    if site.alignment is not None:
-        alignment = polyline(np.array(site.alignment.points) * scale, site.alignment.start_station * scale)
-        where = "the alignment in site.toml"
+        design, alignment = _of_landxml(landxml, given, site)
+    elif site.design.kind == "dxf":
+        design, alignment = _of_drawing(path, given, site)
     else:
-        assert landxml is not None
-        alignment = alignment_of(landxml.alignment(site.design.alignment), landxml.source, scale)
-        where = f"{path.name}: alignment '{alignment.name}'"
-    check_near(alignment.points(alignment.station, 0.0), origin_m[:2], site.grid.unit, where)
-    design: Design
-    if landxml is not None:
-        surface = landxml.surface(site.design.surface)
-        design = tin_of(surface, landxml.source, alignment, site)
-    else:
-        design = read_profile(path, scale)
+        assert given is not None
+        design, alignment = read_profile(path, scale), given
     first, last = design.station_range()
     if last <= alignment.start_station or first >= alignment.end_station:
         raise SurfaceError(
@@ -261,6 +259,60 @@ def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
     level = design.floor_level(np.linspace(first, last, 50))
     check_elevation(level, origin_m[2], path.name, scale)
     return design, alignment
+
+
+def _of_landxml(landxml: LandXml, given: Alignment | None, site: Site) -> tuple[Design, Alignment]:
+    """The design that the keys of site.toml name in a LandXML file, and its alignment unless one is given."""
+    wanted, scale, source = site.design, site.grid.metres_per_unit, landxml.source
+    alignment = given
+    if alignment is None and wanted.alignment is not None:
+        element = landxml.alignment(wanted.alignment)
+        alignment = alignment_of(element, source, scale)
+        _check_line(alignment, site, source)
+        if wanted.profile is not None:
+            profile = long_profile(profile_named(element, wanted.profile, source), source, scale)
+            return _trench(f"{source}: profile {wanted.profile}", *profile.rows(), site), alignment
+    if wanted.pipes is not None:
+        run = run_of(landxml.pipes, wanted.pipes, wanted.pipe_run, scale, source)
+        if alignment is None:
+            alignment = run.line((wanted.start_station or 0.0) * scale)
+            _check_line(alignment, site, source)
+        assert wanted.width is not None and wanted.bedding is not None
+        where = f"{source}: network '{wanted.pipes}'"
+        station, invert = run.rows(alignment, 0.5 * wanted.width * scale, where)
+        name = f"{source}: {wanted.bedding:g} under the inverts of {wanted.pipes}"
+        return _trench(name, station, invert - wanted.bedding * scale, site), alignment
+    assert alignment is not None
+    return tin_of(landxml.surface(wanted.surface), source, alignment, site), alignment
+
+
+def _of_drawing(path: Path, given: Alignment | None, site: Site) -> tuple[Design, Alignment]:
+    """The surface on a layer of a drawing, and the line on another unless an alignment is given."""
+    wanted = site.design
+    assert wanted.layer is not None
+    drawing: Drawing = read_dxf(path, wanted.layer, wanted.alignment_layer, wanted.start_station or 0.0)
+    check_drawing_unit(drawing, wanted.unit, site.grid.unit)
+    alignment = given
+    if alignment is None:
+        assert drawing.alignment is not None
+        alignment = alignment_of(drawing.alignment, drawing.source, site.grid.metres_per_unit)
+        _check_line(alignment, site, drawing.source)
+    return tin_of(drawing.surface, drawing.source, alignment, site), alignment
+
+
+def _check_line(alignment: Alignment, site: Site, source: str) -> None:
+    """Raise SurfaceError where an alignment of the design's own file lies elsewhere."""
+    origin_m = site.grid.to_grid_metres(np.zeros(3))
+    where = f"{source}: alignment '{alignment.name}'"
+    check_near(alignment.points(alignment.station, 0.0), origin_m[:2], site.grid.unit, where)
+
+
+def _trench(name: str, station: np.ndarray, floor: np.ndarray, site: Site) -> ProfileDesign:
+    """A floor of the width and with the side slopes that site.toml says; stations and levels in metres."""
+    assert site.design.width is not None
+    each = np.ones(len(station))
+    width_m = site.design.width * site.grid.metres_per_unit
+    return ProfileDesign(name, station, floor, width_m * each, (site.design.side_slope or 0.0) * each)
 
 
 def check_unit(landxml: LandXml, unit: str) -> None:
@@ -304,40 +356,8 @@ def check_elevation(level: np.ndarray, origin_h: float, source: str, scale: floa
         )
 
 
-def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
-    """The alignment of a LandXML file in grid metres. Raises SurfaceError for what cannot be followed."""
-    where = f"{source}: alignment '{element.name}'"
-    foreign = sorted({e.kind for e in element.elements} - {"Line", "Curve"})
-    if foreign:
-        raise SurfaceError(
-            f"{where} has elements of kind {', '.join(foreign)}; lines and arcs are understood: "
-            "export it with them, or give [alignment] points in site.toml"
-        )
-    if element.equations:
-        raise SurfaceError(
-            f"{where} has station equations, so its stations jump; export it with continuous stations"
-        )
-    if any(e.kind == "Curve" and e.center is None for e in element.elements):
-        raise SurfaceError(f"{where} has an arc without Center; export it with centres")
-    nowhere = (np.nan, np.nan)
-    alignment = from_elements(
-        np.array([e.start for e in element.elements]) * scale,
-        np.array([e.end for e in element.elements]) * scale,
-        np.array([e.center if e.kind == "Curve" and e.center else nowhere for e in element.elements]) * scale,
-        np.array([0 if e.kind == "Line" else (1 if e.clockwise else -1) for e in element.elements]),
-        element.start_station * scale,
-        element.name,
-    )
-    if element.stated_length is not None and abs(alignment.length - element.stated_length * scale) > 0.05:
-        raise SurfaceError(
-            f"{where}: its elements are {alignment.length / scale:.3f} long, the file says "
-            f"{element.stated_length:.3f}; export it again"
-        )
-    return alignment
-
-
 def tin_of(surface: TinSurface, source: str, alignment: Alignment, site: Site) -> TinDesign:
-    """A LandXML surface as a design in grid metres. Raises SurfaceError where it lies elsewhere."""
+    """A surface of a file as a design in grid metres. Raises SurfaceError where it lies elsewhere."""
     points = surface.points * site.grid.metres_per_unit
     origin_m = site.grid.to_grid_metres(np.zeros(3))
     check_near(points[:, :2], origin_m[:2], site.grid.unit, f"{source}: surface '{surface.name}'")
@@ -345,69 +365,7 @@ def tin_of(surface: TinSurface, source: str, alignment: Alignment, site: Site) -
 
 
 def read_profile(path: Path, metres_per_unit: float) -> ProfileDesign:
-    """A design of the columns station, elevation, width, side_slope; further columns are passed over.
-
-    Raises
-    ------
-    SurfaceError
-        Names file, line and column.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise SurfaceError(f"{path.name}: no such file beside site.toml; put the design there") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise SurfaceError(f"{path.name}: cannot be read as UTF-8 text ({error})") from None
-    header = next((line for line in text.splitlines() if line.strip()), "")
-    delimiter = max(",;\t", key=header.count)
-    rows = csv.reader(io.StringIO(text), delimiter=delimiter)
-    names: list[str] | None = None
-    values: list[list[float]] = []
-    try:
-        for row in rows:
-            cells = [cell.strip() for cell in row]
-            if not any(cells) or cells[0].startswith("#"):
-                continue
-            if names is None:
-                names = [cell.lower() for cell in cells]
-                missing = [name for name in PROFILE_COLUMNS if name not in names]
-                if missing:
-                    raise SurfaceError(
-                        f"{path.name}:{rows.line_num}: the first line must name the columns "
-                        f"{', '.join(PROFILE_COLUMNS)}; missing: {', '.join(missing)}"
-                    )
-                continue
-            values.append(_profile_row(cells, names, f"{path.name}:{rows.line_num}"))
-            if len(values) > MAX_PROFILE_ROWS:
-                raise SurfaceError(f"{path.name}: more than {MAX_PROFILE_ROWS} rows; thin the profile out")
-    except csv.Error as error:
-        raise SurfaceError(f"{path.name}:{rows.line_num}: not readable as CSV ({error})") from None
-    if len(values) < 2:
-        raise SurfaceError(
-            f"{path.name}: holds {len(values)} rows of the design; at least two stations are needed"
-        )
-    table = np.array(values)
-    bad = np.flatnonzero(np.diff(table[:, 0]) <= 0)
-    if len(bad):
-        raise SurfaceError(
-            f"{path.name}: stations must grow from row to row; {table[bad[0] + 1, 0]:g} follows {table[bad[0], 0]:g}"
-        )
-    if np.any(table[:, 2] <= 0) or np.any(table[:, 3] < 0):
-        raise SurfaceError(f"{path.name}: width must be positive and side_slope must not be negative")
+    """A design of the columns station, elevation, width, side_slope. Raises SurfaceError with file, line and column."""
+    table = read_profile_rows(path)
     metres = table[:, :3] * metres_per_unit
     return ProfileDesign(path.name, metres[:, 0], metres[:, 1], metres[:, 2], table[:, 3])
-
-
-def _profile_row(cells: list[str], names: list[str], where: str) -> list[float]:
-    numbers = []
-    for name in PROFILE_COLUMNS:
-        column = names.index(name)
-        text = cells[column] if column < len(cells) else ""
-        try:
-            number = float(text)
-        except ValueError:
-            number = np.nan
-        if not np.isfinite(number):
-            raise SurfaceError(f"{where}: {name}: expected a number, found '{text}'")
-        numbers.append(number)
-    return numbers
