@@ -80,7 +80,7 @@ class AlignmentSection(Section):
             self._alignment, self._elements, self._equations = attributes, [], 0
         elif name == "StaEquation":
             self._equations += 1
-        elif path[-3:-1] == ["Alignment", "CoordGeom"]:
+        elif path[-3:-1] == ["Alignment", "CoordGeom"] and name != "Feature":
             self.count("elements of alignments")
             self._element = _Heard(name, attributes, {}, [])
             return MAX_LIST_TEXT if name == "Chain" else 0
