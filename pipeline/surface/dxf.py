@@ -233,21 +233,25 @@ class _Heard:
         """Hear the section of entities to its end."""
         wanted = {kind.encode(): kind for kind in FACES | LINES}
         polyline: Entity | None = None
+        polyline_layer = ""
         entity: Entity | None = None
         layer, paper = b"0", False
         kind = b""
         for code, value in tags:
             if code == 0:
-                if kind in (b"VERTEX", b"SEQEND"):
+                if kind == b"VERTEX":
                     if polyline is not None and entity is not None:
                         polyline.vertices.append(entity)
                         if len(polyline.vertices) > MAX_TAGS:
                             raise SurfaceError(f"{self.source}: a polyline of more than {MAX_TAGS} vertices")
-                    if kind == b"SEQEND":
-                        polyline = None
-                elif kind and not paper:
+                elif kind == b"POLYLINE" and not paper:
+                    polyline, polyline_layer = entity, self._name(layer)
+                elif kind and kind != b"SEQEND" and not paper:
                     self._take(kind, entity, self._name(layer))
-                    polyline = entity if kind == b"POLYLINE" else None
+                # A polyline is whole when its vertices, which follow it, are.
+                if polyline is not None and value not in (b"VERTEX", b"SEQEND"):
+                    self._take(b"POLYLINE", polyline, polyline_layer)
+                    polyline = None
                 if value == b"ENDSEC":
                     self.whole = True
                     return
