@@ -274,11 +274,12 @@ def _of_landxml(landxml: LandXml, given: Alignment | None, site: Site) -> tuple[
             return _trench(f"{source}: profile {wanted.profile}", *profile.rows(), site), alignment
     if wanted.pipes is not None:
         run = run_of(landxml.pipes, wanted.pipes, wanted.pipe_run, scale, source)
+        where = f"{source}: network '{wanted.pipes}'"
+        origin_m = site.grid.to_grid_metres(np.zeros(3))
+        check_near(run.ends[..., :2].reshape(-1, 2), origin_m[:2], site.grid.unit, where)
         if alignment is None:
             alignment = run.line((wanted.start_station or 0.0) * scale)
-            _check_line(alignment, site, source)
         assert wanted.width is not None and wanted.bedding is not None
-        where = f"{source}: network '{wanted.pipes}'"
         station, invert = run.rows(alignment, 0.5 * wanted.width * scale, where)
         name = f"{source}: {wanted.bedding:g} under the inverts of {wanted.pipes}"
         return _trench(name, station, invert - wanted.bedding * scale, site), alignment

@@ -1,12 +1,15 @@
 """The design against closed forms; what is floor; what does not belong to the site."""
 
+import re
+
+import ezdxf
 import numpy as np
 import pytest
 
 from pipeline.config import load_site
 from pipeline.errors import SurfaceError
 from pipeline.surface.alignment import polyline
-from pipeline.surface.design import FLOOR_SLOPE, TinDesign, read_design, read_profile
+from pipeline.surface.design import FLOOR_SLOPE, TinDesign, floor_sentence, read_design, read_profile
 
 FOOT = 1200 / 3937
 SITE = """
@@ -196,14 +199,22 @@ def test_the_alignment_of_the_file_is_used_where_site_toml_has_none(tmp_path):
     assert (alignment.start_station, alignment.end_station, alignment.name) == (100, 120, "CL")
 
 
-SPIRAL = "<Spiral><Start>4123000 512000</Start><End>4123020 512000</End></Spiral>"
+SPIRAL = (
+    '<Spiral length="20" radiusStart="INF" radiusEnd="90" rot="cw" spiType="clothoid">'
+    "<Start>4123000 512000</Start><End>4123020 512000</End></Spiral>"
+)
 LINE = "<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>"
 
 
 @pytest.mark.parametrize(
     "geometry, length, sentence",
     [
-        (SPIRAL, 20, r"alignment 'CL' has elements of kind Spiral; lines and arcs are understood"),
+        (SPIRAL.replace("clothoid", "bloss"), 20, "alignment 'CL' has spirals that are bloss; clothoids are understood"),
+        (SPIRAL.replace('spiType="clothoid"', ""), 20, "alignment 'CL' has spirals that are of no kind"),
+        (SPIRAL.replace('length="20"', ""), 20, "alignment 'CL' has a spiral without length"),
+        (SPIRAL.replace("Spiral", "Clothoid"), 20, "has elements of kind Clothoid; lines, arcs and spirals are"),
+        (SPIRAL.replace('"20"', '"21"'), 20, r"spiral 1 is stated as 21\.000 m long, .* 20\.0\d\d m from its start"),
+        (LINE + "</CoordGeom><StaEquation staBack='110' staAhead='200'/><CoordGeom>", 20, "has station equations"),
         (LINE, 21, r"its elements are 20\.000 long, the file says 21\.000"),
         (LINE.replace("Line", "Curve"), 20, "has an arc without Center"),
     ],
@@ -256,3 +267,156 @@ def test_a_missing_or_unreadable_design_is_one_sentence(tmp_path):
     binary.write_bytes(b"\xff\xfe\x00\x01")
     with pytest.raises(SurfaceError, match="cannot be read as UTF-8"):
         read_design(binary, site("design.csv", "profile_csv"))
+
+
+# Designs of other kinds: each gives the levels of one closed form, and is refused with its axes swapped.
+
+AXIS = '<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>'
+LEVELS = '<PVI>100 50</PVI><ParaCurve length="8">110 49</ParaCurve><PVI>120 50</PVI>'
+STRUCTS = (
+    '<Struct name="A"><Center>4123000 512000</Center><Invert elev="50" flowDir="out" refPipe="p"/></Struct>'
+    '<Struct name="B"><Center>4123020 512000</Center><Invert elev="49" flowDir="in" refPipe="p"/></Struct>'
+)
+
+
+def swapped(text):
+    """Easting first, as no LandXML has it."""
+    return re.sub(r"(4123\d{3}) (512\d{3})", r"\2 \1", text)
+
+
+def xml_of(tmp_path, more, levels=LEVELS, structs=STRUCTS, change=str):
+    axis = f'<Alignment name="CL" staStart="100"><CoordGeom>{AXIS}</CoordGeom>'
+    axis += f'<Profile><ProfAlign name="floor">{levels}</ProfAlign></Profile></Alignment>'
+    pipes = f'<PipeNetwork name="storm"><Structs>{structs}</Structs><Pipes><Pipe name="p" refStart="A" refEnd="B">'
+    pipes += '<CircPipe diameter="0.3"/></Pipe></Pipes></PipeNetwork>'
+    text = '<LandXML><Units><Metric linearUnit="meter"/></Units>'
+    text += change(f"<Alignments>{axis}</Alignments><PipeNetworks>{pipes}</PipeNetworks></LandXML>")
+    return written(tmp_path, text), site("design.xml", "landxml", points="file", more=more)
+
+
+PROFILE_KEYS = 'alignment = "CL"\nprofile = "floor"\nwidth = 1.2\nside_slope = 0.5'
+PIPE_KEYS = 'pipes = "storm"\nbedding = 0.15\nwidth = 1.2'
+
+
+def test_a_landxml_profile_gives_the_level_of_the_floor(tmp_path):
+    design, alignment = read_design(*xml_of(tmp_path, PROFILE_KEYS))
+    assert (alignment.start_station, alignment.end_station) == (100, 120)
+    station = np.linspace(100, 120, 400)
+    bend = np.clip(station - 106, 0, 8)
+    level = 50 - 0.1 * (station - 100) + np.where(station < 114, 0.2 / 16 * bend**2, 0.2 * (station - 110))
+    assert np.allclose(design.floor_level(station), level, rtol=0, atol=2e-6)
+    assert design.elevation(104.0, 1.6) == pytest.approx(49.6 + 1.0 / 0.5)
+    assert design.is_floor(104.0, np.array([0.59, 0.61])).tolist() == [True, False]
+    assert floor_sentence(design).startswith("The floor is everything within half")
+
+
+def test_a_run_of_pipes_gives_a_floor_under_its_inverts(tmp_path):
+    design, alignment = read_design(*xml_of(tmp_path, PIPE_KEYS + "\nstart_station = 30"))
+    assert (alignment.start_station, alignment.end_station) == (30, 50)
+    assert design.floor_level(np.array([30.0, 40.0, 50.0])) == pytest.approx([49.85, 49.35, 48.85])
+    assert np.isnan(design.elevation(40.0, 0.61)) and design.elevation(40.0, 0.59) == pytest.approx(49.35)
+    assert "0.15 under the inverts of storm" in design.name
+    along, _ = read_design(*xml_of(tmp_path, PIPE_KEYS + '\nalignment = "CL"\nside_slope = 1'))
+    assert along.floor_level(np.array([110.0])) == pytest.approx([49.35])
+    assert along.elevation(110.0, 1.6) == pytest.approx(50.35)
+
+
+def test_pipes_may_lie_along_the_alignment_of_the_site_file(tmp_path):
+    path, _ = xml_of(tmp_path, PIPE_KEYS)
+    design, _ = read_design(path, site("design.xml", "landxml", start=7.0, more=PIPE_KEYS))
+    assert design.floor_level(np.array([17.0])) == pytest.approx([49.35])
+
+
+def test_a_job_in_feet_has_its_width_and_bedding_in_feet(tmp_path):
+    path, _ = xml_of(tmp_path, PIPE_KEYS)
+    path.write_text(path.read_text().replace("Metric", "Imperial").replace('"meter"', '"USSurveyFoot"'))
+    feet = site("design.xml", "landxml", unit="us_survey_foot", points="file", more=PIPE_KEYS)
+    design, alignment = read_design(path, feet)
+    assert alignment.length == pytest.approx(20 * FOOT)
+    assert design.floor_level(np.array([10 * FOOT])) == pytest.approx([49.35 * FOOT])
+    assert design.floor_reach() == pytest.approx(0.6 * FOOT)
+
+
+def dxf_of(tmp_path, run=1.5, turn=lambda p: p, units=6, more="", line=True):
+    """A drawing of the trapezoid, and of its axis from station 100."""
+    doc = ezdxf.new()
+    doc.header["$INSUNITS"] = units
+    points, faces = trapezoid(run=run)
+    points = points + [512_000, 4_123_000, 50]
+    for face in faces:
+        doc.modelspace().add_3dface([turn(points[k]) for k in face], dxfattribs={"layer": "t"})
+    ends = np.array([[512_000, 4_123_000, 0], [512_000, 4_123_020, 0]])
+    doc.modelspace().add_lwpolyline([turn(p)[:2] for p in ends], dxfattribs={"layer": "axis"})
+    path = tmp_path / "design.dxf"
+    doc.saveas(path)
+    keys = 'layer = "t"\n' + ('alignment_layer = "axis"\nstart_station = 100\n' if line else "") + more
+    return path, site("design.dxf", "dxf", points="file" if line else None, more=keys)
+
+
+def test_a_drawing_and_the_same_landxml_say_the_same(tmp_path):
+    drawn, axis = read_design(*dxf_of(tmp_path))
+    xml = written(tmp_path, landxml(*trapezoid()))
+    surface, _ = read_design(xml, site("design.xml", "landxml", start=100.0))
+    assert axis.start_station == 100
+    station, offset = np.meshgrid(np.linspace(100.1, 119.9, 30), np.linspace(-5, 5, 40))
+    assert np.allclose(drawn.elevation(station, offset), surface.elevation(station, offset), rtol=0, atol=1e-6)
+    assert np.array_equal(drawn.is_floor(station, offset), surface.is_floor(station, offset))
+    assert read_design(*dxf_of(tmp_path, line=False))[0].floor_reach() == pytest.approx(0.5)
+
+
+def test_a_drawing_may_have_vertical_walls(tmp_path):
+    design, _ = read_design(*dxf_of(tmp_path, run=0.0))
+    assert design.is_floor(110.0, np.array([-0.6, 0.0, 0.6])).tolist() == [False, True, False]
+    assert design.elevation(110.0, np.array([0.0, 0.6])) == pytest.approx([50.1, 52.1])
+
+
+def test_a_drawing_without_a_unit_needs_one_in_the_site_file(tmp_path):
+    with pytest.raises(SurfaceError, match=r"does not say its unit .* write unit = \"m\""):
+        read_design(*dxf_of(tmp_path, units=0))
+    assert read_design(*dxf_of(tmp_path, units=0, more='unit = "m"'))[1].length == pytest.approx(20)
+    with pytest.raises(SurfaceError, match="its unit is millimetres"):
+        read_design(*dxf_of(tmp_path, units=4))
+
+
+@pytest.mark.parametrize("keys", [PROFILE_KEYS, PIPE_KEYS])
+def test_landxml_lines_with_easting_first_are_refused(tmp_path, keys):
+    with pytest.raises(SurfaceError, match="(alignment 'CL'|network 'storm'): lies around .* northing and easting look swapped"):
+        read_design(*xml_of(tmp_path, keys, change=swapped))
+
+
+@pytest.mark.parametrize("line", [True, False])
+def test_a_drawing_with_northing_first_is_refused(tmp_path, line):
+    where = "alignment 'axis'" if line else "surface 't'"
+    with pytest.raises(SurfaceError, match=f"{where}: lies around .* northing and easting look swapped"):
+        read_design(*dxf_of(tmp_path, turn=lambda p: (p[1], p[0], p[2]), line=line))
+
+
+def test_pipes_of_another_place_beside_the_alignment_of_the_site_file_are_refused(tmp_path):
+    path, _ = xml_of(tmp_path, PIPE_KEYS, change=swapped)
+    with pytest.raises(SurfaceError, match="network 'storm': lies around .* look swapped"):
+        read_design(path, site("design.xml", "landxml", more=PIPE_KEYS))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "\ufeffstation;elevation;width;side_slope\n0;50,25;1,5;0\n9,5;50,75;1,5;0\n",
+        "Station\tElevation\tWidth\tSide_Slope\tnote\n0\t50,25\t1.5\t0\t1,2,3\n9.5\t50,75\t1,5\t0\t\n",
+        '"station","elevation","width","side_slope"\r\n"0","50.25","1.5","0"\r\n"9.5","50.75","1.5","0",,\r\n',
+    ],
+)
+def test_decimal_commas_byte_order_marks_and_quotes_are_understood(tmp_path, text):
+    path = tmp_path / "design.csv"
+    path.write_text(text, encoding="utf-8", newline="")
+    design = read_profile(path, 1.0)
+    assert design.station.tolist() == [0, 9.5]
+    assert design.floor.tolist() == [50.25, 50.75]
+    assert design.width.tolist() == [1.5, 1.5]
+
+
+def test_decimal_commas_between_commas_are_refused_and_not_misread(tmp_path):
+    text = "station,elevation,width,side_slope\n0,0,50,25,1,5,0,0\n9,5,50,75,1,5,0,0\n"
+    with pytest.raises(SurfaceError, match=r"design\.csv:2: has 8 cells for 4 columns; .* semicolons"):
+        read_profile(profile(tmp_path, text), 1.0)
+    with pytest.raises(SurfaceError, match=r"design\.csv:2: elevation: expected a number, found '1\.234,5'"):
+        read_profile(profile(tmp_path, "station;elevation;width;side_slope\n0;1.234,5;1;0\n9;50;1;0\n"), 1.0)
