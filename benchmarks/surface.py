@@ -95,7 +95,9 @@ def landxml_net(path: Path) -> None:
     h = 50 + 0.01 * (n * e % 97)
     at = np.flatnonzero((n < NET - 1) & (e < NET - 1)) + 1
     with path.open("w", encoding="utf-8") as out:
-        out.write('<LandXML><Units><Metric linearUnit="meter"/></Units><Surfaces><Surface name="t"><Definition><Pnts>\n')
+        out.write(
+            '<LandXML><Units><Metric linearUnit="meter"/></Units><Surfaces><Surface name="t"><Definition><Pnts>\n'
+        )
         for i in range(len(n)):
             out.write(f'<P id="{i + 1}">{4_123_000 + n[i]:.6f} {512_000 + e[i]:.6f} {h[i]:.6f}</P>\n')
         out.write("</Pnts><Faces>\n")
@@ -109,7 +111,9 @@ def dxf_net(path: Path) -> None:
     n, e = np.divmod(np.arange(NET * NET), NET)
     points = np.stack([512_000.0 + e, 4_123_000.0 + n, 50 + 0.01 * (n * e % 97)], axis=1)
     at = np.flatnonzero((n < NET - 1) & (e < NET - 1))
-    corners = np.stack([at, at + 1, at + NET, at + NET, at + 1, at + NET + 1, at + NET, at + NET], axis=1).reshape(-1, 4)
+    corners = np.stack(
+        [at, at + 1, at + NET, at + NET, at + 1, at + NET + 1, at + NET, at + NET], axis=1
+    ).reshape(-1, 4)
     with path.open("w", encoding="ascii") as out:
         out.write("0\nSECTION\n2\nHEADER\n9\n$INSUNITS\n70\n6\n0\nENDSEC\n0\nSECTION\n2\nENTITIES\n")
         for face in points[corners]:

@@ -182,7 +182,11 @@ class Design(Section):
             return "a LandXML profile", ("profile", "alignment", "width"), ("side_slope",)
         if self.pipes is not None:
             start = () if self.alignment else ("start_station",)
-            return "a run of LandXML pipes", ("pipes", "bedding", "width"), ("pipe_run", "side_slope", "alignment", *start)
+            return (
+                "a run of LandXML pipes",
+                ("pipes", "bedding", "width"),
+                ("pipe_run", "side_slope", "alignment", *start),
+            )
         return "a LandXML surface", (), ("surface", "alignment")
 
     @property

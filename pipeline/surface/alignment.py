@@ -343,9 +343,13 @@ def from_elements(
     angle = np.where(turn > 0, 2 * np.pi - angle, angle)
     length = np.where(arc, radius * angle, chord)
     if curvature is not None and spiral_length is not None:
-        for k in np.flatnonzero(np.isfinite(curvature[:, 0])):
+        for k in map(int, np.flatnonzero(np.isfinite(curvature[:, 0]))):
             length[k] = _spiral_length(
-                end[k] - start[k], curvature[k], spiral_length[k], tolerance_m, f"alignment '{name}': spiral {k + 1}"
+                end[k] - start[k],
+                curvature[k],
+                spiral_length[k],
+                tolerance_m,
+                f"alignment '{name}': spiral {k + 1}",
             )
     alignment = Alignment(
         start=start,
@@ -367,7 +371,9 @@ def _spiral_length(
     k0, k1 = -float(curvature[0]), -float(curvature[1])
     if not stated > 0:
         raise SurfaceError(f"{where} has no length; remove it")
-    if max(abs(k0), abs(k1)) * stated > np.pi:  # beyond that the distance of its ends no longer tells its length
+    if (
+        max(abs(k0), abs(k1)) * stated > np.pi
+    ):  # beyond that the distance of its ends no longer tells its length
         raise SurfaceError(f"{where} turns by more than half a circle with its radii; are they right?")
     fitted = clothoid_to(chord, (k0, k1), stated).length
     if abs(fitted - stated) > tolerance_m:

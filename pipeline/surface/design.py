@@ -238,7 +238,9 @@ def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
     given: Alignment | None = None
     if site.alignment is not None:
         given = polyline(np.array(site.alignment.points) * scale, site.alignment.start_station * scale)
-        check_near(given.points(given.station, 0.0), origin_m[:2], site.grid.unit, "the alignment in site.toml")
+        check_near(
+            given.points(given.station, 0.0), origin_m[:2], site.grid.unit, "the alignment in site.toml"
+        )
     design: Design
     if site.design.kind == "landxml":
         landxml = read_landxml(path)

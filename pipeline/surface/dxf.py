@@ -28,8 +28,19 @@ MAX_TAGS = 4_000_000
 """Pairs of one entity; a mesh of 100,000 faces has one million."""
 MAX_NAMES = 1000
 UNITS = {2: "international_foot", 6: "m", 21: "us_survey_foot"}
-_UNIT_WORDS = {1: "inches", 3: "miles", 4: "millimetres", 5: "centimetres", 7: "kilometres", 10: "yards", 14: "decimetres"}
-_OTHERS = {b"AutoCAD Binary DXF": "a binary DXF: save it as a text (ASCII) DXF", b"AC1": "a DWG: save it as a DXF"}
+_UNIT_WORDS = {
+    1: "inches",
+    3: "miles",
+    4: "millimetres",
+    5: "centimetres",
+    7: "kilometres",
+    10: "yards",
+    14: "decimetres",
+}
+_OTHERS = {
+    b"AutoCAD Binary DXF": "a binary DXF: save it as a text (ASCII) DXF",
+    b"AC1": "a DWG: save it as a DXF",
+}
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,9 @@ def read_dxf(path: Path, layer: str, alignment_layer: str | None, start_station:
     surface = heard.faces.surface(heard.told_of(layer))
     alignment = None
     if alignment_layer is not None:
-        alignment = line_of(heard.lines, alignment_layer, source, heard.told_of(alignment_layer), start_station)
+        alignment = line_of(
+            heard.lines, alignment_layer, source, heard.told_of(alignment_layer), start_station
+        )
     return Drawing(source, heard.unit_code, surface, alignment)
 
 
@@ -107,12 +120,12 @@ def check_drawing_unit(drawing: Drawing, said: str | None, unit: str) -> None:
         if said is None:
             raise SurfaceError(
                 f"{drawing.source}: does not say its unit ($INSUNITS is 0); if it is drawn in the unit of the grid, "
-                f"write unit = \"{unit}\" under [design] in site.toml"
+                f'write unit = "{unit}" under [design] in site.toml'
             )
     elif drawing.unit != unit:
         raise SurfaceError(
-            f"{drawing.source}: its unit is {drawing.unit_as_written}, but grid.unit in site.toml is '{unit}'; save the "
-            "drawing in the unit of the grid, with $INSUNITS set to it or to 0, or mend grid.unit"
+            f"{drawing.source}: its unit is {drawing.unit_as_written}, but grid.unit in site.toml is '{unit}'; save "
+            "the drawing in the unit of the grid, with $INSUNITS set to it or to 0, or mend grid.unit"
         )
 
 
@@ -197,7 +210,11 @@ class _Heard:
         if layer.casefold() in self._in_blocks:
             return "what it holds stands inside blocks: explode them"
         names = sorted(self._kinds)[:8]
-        return f"there are entities on {', '.join(repr(name) for name in names)}" if names else "it has no entities"
+        return (
+            f"there are entities on {', '.join(repr(name) for name in names)}"
+            if names
+            else "it has no entities"
+        )
 
     def _header(self, variable: bytes, value: bytes) -> None:
         if variable == b"$INSUNITS":
@@ -281,9 +298,14 @@ class _Heard:
             return
         if layer == self.layer.casefold() and entity.kind in FACES:
             self.faces.add(entity)
-        if self.alignment_layer is not None and layer == self.alignment_layer.casefold() and entity.kind in LINES:
+        if (
+            self.alignment_layer is not None
+            and layer == self.alignment_layer.casefold()
+            and entity.kind in LINES
+        ):
             self.lines.append(entity)
             if len(self.lines) > MAX_LINES:
                 raise SurfaceError(
-                    f"{self.source}: layer '{layer}' has more than {MAX_LINES} lines; draw the alignment alone on its layer"
+                    f"{self.source}: layer '{layer}' has more than {MAX_LINES} lines; draw the alignment alone on "
+                    "its layer"
                 )

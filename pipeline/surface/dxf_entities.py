@@ -35,9 +35,15 @@ class Entity:
         try:
             x, y = values[code], values[code + 10]
         except KeyError:
-            raise SurfaceError(f"{source}: a {self.kind} without coordinates; save the drawing again") from None
+            raise SurfaceError(
+                f"{source}: a {self.kind} without coordinates; save the drawing again"
+            ) from None
         z = values.get(code + 20, b"0")
-        return number_of(x, self.kind, source), number_of(y, self.kind, source), number_of(z, self.kind, source)
+        return (
+            number_of(x, self.kind, source),
+            number_of(y, self.kind, source),
+            number_of(z, self.kind, source),
+        )
 
     def is_mirrored(self, source: str) -> bool:
         """Whether it is drawn as seen from below. Raises SurfaceError where it is drawn in a slanting plane."""

@@ -163,7 +163,9 @@ def _corners_of(points: _Corners, faces: list[list[int]], kind: str, source: str
                 f"{source}: a face of a {kind} has {len(face)} corners; export the surface as triangles"
             )
         if min(face) < 0 or max(face) >= len(points):
-            raise SurfaceError(f"{source}: a face of a {kind} names a point that is not there; save the drawing again")
+            raise SurfaceError(
+                f"{source}: a face of a {kind} names a point that is not there; save the drawing again"
+            )
         quads.append([*face, face[2]][:4])
     if not quads:
         return np.empty((0, 4, 3))

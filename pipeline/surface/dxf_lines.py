@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -104,7 +105,9 @@ def _piece(entity: Entity, where: str, source: str) -> _Piece | None:
         if flags & _MESHES:
             return None
         if flags & _SPLINE_FIT:
-            raise SurfaceError(f"{where} has a polyline that is smoothed to a spline; convert it to lines and arcs")
+            raise SurfaceError(
+                f"{where} has a polyline that is smoothed to a spline; convert it to lines and arcs"
+            )
         for vertex in entity.vertices:
             if not vertex.whole(70, source) & _FRAME:
                 x, y, _ = vertex.point(10, source)
@@ -116,7 +119,7 @@ def _piece(entity: Entity, where: str, source: str) -> _Piece | None:
     mirrored = flat and entity.is_mirrored(source)
     sign = -1.0 if mirrored else 1.0
     elements = []
-    for (x, y, bulge), (u, v, _) in zip(corners[:-1], corners[1:], strict=True):
+    for (x, y, bulge), (u, v, _) in itertools.pairwise(corners):
         a, b = (sign * x, y), (sign * u, v)
         if a != b:
             elements.append(_segment(a, b, sign * bulge))

@@ -234,7 +234,8 @@ class _Reader:
         unit = _UNITS.get(written.lower()) if written else None
         diameter = METRES_PER_DIAMETER_UNIT.get(self._units.diameter.lower())
         scale = diameter / METRES_PER_UNIT[unit] if diameter and unit else None
-        pipes, fault = (), ""
+        pipes: tuple[XmlPipe, ...] = ()
+        fault = ""
         try:
             pipes = self._pipes.pipes(self._points, scale)
         except SurfaceError as error:

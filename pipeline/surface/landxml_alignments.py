@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
@@ -147,11 +148,7 @@ class AlignmentSection(Section):
             if len(places) < 2:
                 raise SurfaceError(f"{self.source}: a {heard.kind} of {where} has fewer than two points")
             # The list of an irregular line often begins with its Start and ends with its End.
-            return [
-                XmlElement("Line", a, b, None, False)
-                for a, b in zip(places[:-1], places[1:], strict=True)
-                if a != b
-            ]
+            return [XmlElement("Line", a, b, None, False) for a, b in itertools.pairwise(places) if a != b]
         if start is None or end is None:
             raise SurfaceError(
                 f"{self.source}: a {heard.kind} of {where} has no Start or no End; export it with coordinates, or with "
@@ -176,7 +173,9 @@ class AlignmentSection(Section):
         radii = []
         for key in ("radiusStart", "radiusEnd"):
             text = attributes.get(key, "").strip()
-            radius = math.inf if text.upper() in ("INF", "+INF") else self.numbers(text, 1, f"{key} of {where}")[0]
+            radius = (
+                math.inf if text.upper() in ("INF", "+INF") else self.numbers(text, 1, f"{key} of {where}")[0]
+            )
             if radius <= 0:
                 raise SurfaceError(
                     f"{self.source}: {key} of {where}: expected a positive number or INF, found '{text[:60]}'"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass, field
 
@@ -142,10 +143,7 @@ class PipeSection(Section):
         corners = [start, end]
         if pipe.center is not None:
             corners = _chords(start, end, points.resolve(pipe.center, where))
-        return [
-            XmlPipe(network.name, pipe.name, a, b, diameter)
-            for a, b in zip(corners[:-1], corners[1:], strict=True)
-        ]
+        return [XmlPipe(network.name, pipe.name, a, b, diameter) for a, b in itertools.pairwise(corners)]
 
     def _invert(self, struct: _Struct, pipe: str, flow: str, where: str) -> float:
         own = [invert for invert in struct.inverts if invert[0] == pipe]

@@ -105,7 +105,9 @@ class ProfileSection(Section):
         needed = "radius" if kind == "CircCurve" else None
         missing = [key for key, value in shape.items() if value is None and (needed is None or key == needed)]
         if missing:
-            raise SurfaceError(f"{self.source}: {where} at station {station:g} has no {missing[0]}; export it again")
+            raise SurfaceError(
+                f"{self.source}: {where} at station {station:g} has no {missing[0]}; export it again"
+            )
         if kind == "ParaCurve":
             assert shape["length"] is not None
             shape["lengthIn"] = shape["lengthOut"] = 0.5 * shape["length"]

@@ -2,8 +2,8 @@
 
 Where two gradients g1 and g2 (rise per run) meet, a parabola of horizontal length L begins L / 2 before the point of
 intersection and changes the gradient evenly, by (g2 - g1) / L a metre. An unsymmetrical one is two parabolas that meet
-under the point with one tangent. A circle of radius R touches both gradients R tan(d / 2) from the point, measured along
-them, d being the angle between them.
+under the point with one tangent. A circle of radius R touches both gradients R tan(d / 2) from the point, measured
+along them, d being the angle between them.
 """
 
 from __future__ import annotations
@@ -125,7 +125,9 @@ def long_profile(profile: XmlProfile, source: str, scale: float) -> LongProfile:
         roundings.append(_rounding(vertices[k], float(gradient[k - 1]), float(gradient[k]), scale, at))
     roundings.append(_Rounding(0.0, 0.0, ()))
     for k in (0, -1):
-        if vertices[k].kind != "PVI" and any((vertices[k].length_in, vertices[k].length_out, vertices[k].radius)):
+        if vertices[k].kind != "PVI" and any(
+            (vertices[k].length_in, vertices[k].length_out, vertices[k].radius)
+        ):
             raise SurfaceError(
                 f"{where}: its {'first' if k == 0 else 'last'} point is a {vertices[k].kind}, which has a gradient on "
                 "one side only; export the profile with a point beyond it"

@@ -54,7 +54,6 @@ class PipeRun:
             length = float(np.hypot(*(end - start)[:2]))
             share = np.linspace(0.0, 1.0, max(2, int(length / _SAMPLE_M) + 1))[:, None]
             points = start + share * (end - start)
-            # Just inside both ends, where two pipes meet in a corner and each has a side of it.
             station, offset = alignment.station_offset(points[:, :2])
             if np.abs(offset).max() > reach_m:
                 raise SurfaceError(
@@ -67,8 +66,12 @@ class PipeRun:
         if station[-1] < station[0]:
             station, invert = station[::-1], invert[::-1]
         if np.any(np.diff(station) < -1e-3):
-            raise SurfaceError(f"{where}: its pipes turn back along the alignment; name pipes of one run with design.pipe_run")
-        keep = np.concatenate([[True], (np.abs(np.diff(station)) > _STEP_M) | (np.abs(np.diff(invert)) > _SAME)])
+            raise SurfaceError(
+                f"{where}: its pipes turn back along the alignment; name pipes of one run with design.pipe_run"
+            )
+        keep = np.concatenate(
+            [[True], (np.abs(np.diff(station)) > _STEP_M) | (np.abs(np.diff(invert)) > _SAME)]
+        )
         station, invert = station[keep], invert[keep]
         # Rounding leaves two rows at a structure a little in the wrong order, or at one place.
         station = np.maximum.accumulate(station + _STEP_M * _repeats(station))
@@ -116,7 +119,9 @@ def run_of(
             f"{source}: network '{network}' has no pipe '{missing[0]}'; mend design.pipe_run in site.toml"
         )
     if names:
-        own = sorted((pipe for pipe in own if pipe.name in set(names)), key=lambda pipe: list(names).index(pipe.name))
+        own = sorted(
+            (pipe for pipe in own if pipe.name in set(names)), key=lambda pipe: list(names).index(pipe.name)
+        )
     ends = [np.array([pipe.start, pipe.end]) * scale for pipe in own]
     order = _in_order(ends, [pipe.name for pipe in own], f"{source}: network '{network}'")
     return PipeRun(
@@ -139,7 +144,9 @@ def _in_order(ends: list[np.ndarray], names: list[str], where: str) -> list[tupl
             raise SurfaceError(f"{where}: the pipes {listed} meet at one structure; {advice}")
     tips = [k for touching in at.values() if len(touching) == 1 for k in touching]
     if len(tips) != 2:
-        raise SurfaceError(f"{where}: its pipes make {len(tips) // 2 or 'no'} separate lines with two ends; {advice}")
+        raise SurfaceError(
+            f"{where}: its pipes make {len(tips) // 2 or 'no'} separate lines with two ends; {advice}"
+        )
     # From the end where water comes in: the one whose pipe begins there; if both or neither do, the first in the file.
     upstream = [k for k in tips if len(at[_key(ends[k][0])]) == 1]
     here = _key(ends[upstream[0]][0]) if upstream else _key(ends[min(tips)][1])

@@ -24,7 +24,9 @@ def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
             f"{where} has elements of kind {', '.join(foreign)}; lines, arcs and spirals are understood: "
             "export it with them, or give [alignment] points in site.toml"
         )
-    spirals = sorted({e.spiral or "of no kind" for e in element.elements if e.kind == "Spiral"} - {"clothoid"})
+    spirals = sorted(
+        {e.spiral or "of no kind" for e in element.elements if e.kind == "Spiral"} - {"clothoid"}
+    )
     if spirals:
         raise SurfaceError(
             f"{where} has spirals that are {', '.join(spirals)}; clothoids are understood: export it with them, or as "
@@ -50,7 +52,10 @@ def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
         curvature=np.array([_curvature(e) for e in element.elements]) / scale if spiral else None,
         spiral_length=np.array([np.nan if e.length is None else e.length * scale for e in element.elements]),
     )
-    if element.stated_length is not None and abs(alignment.length - element.stated_length * scale) > _LENGTH_M:
+    if (
+        element.stated_length is not None
+        and abs(alignment.length - element.stated_length * scale) > _LENGTH_M
+    ):
         raise SurfaceError(
             f"{where}: its elements are {alignment.length / scale:.3f} long, the file says "
             f"{element.stated_length:.3f}; export it again"

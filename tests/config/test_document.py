@@ -183,8 +183,20 @@ SITE_MISTAKES = [
     ("high_mm = 25", "high_mm = -25", "high_mm = -25", "tolerance.high_mm", "greater than or equal to 0"),
     ("id = 10, size_m = 0.3", "id = 11, size_m = 0.3", "", "", "stands on two benchmarks, bm1 and bm2"),
     ("[alignment]\npoints = [[1000, 2000], [1000, 2020]]\n", "", "", "", "stations need an alignment"),
-    ('kind = "profile_csv"', 'kind = "dwg"', 'kind = "dwg"', "design.kind", "'profile_csv', 'landxml' or 'dxf'"),
-    ('kind = "profile_csv"', 'kind = "dxf"', "[design]", "design", "a design that is a DXF drawing needs layer"),
+    (
+        'kind = "profile_csv"',
+        'kind = "dwg"',
+        'kind = "dwg"',
+        "design.kind",
+        "'profile_csv', 'landxml' or 'dxf'",
+    ),
+    (
+        'kind = "profile_csv"',
+        'kind = "dxf"',
+        "[design]",
+        "design",
+        "a design that is a DXF drawing needs layer",
+    ),
     (
         'kind = "profile_csv"',
         'kind = "profile_csv"\nlayer = "x"\nwidth = 1.0',

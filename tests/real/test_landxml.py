@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from pipeline.surface.design import TinDesign
 from pipeline.errors import SurfaceError
+from pipeline.surface.design import TinDesign
 from pipeline.surface.landxml import profile_named, read_landxml
 from pipeline.surface.long_profile import long_profile
 from pipeline.surface.pipe_run import run_of
@@ -103,7 +103,9 @@ def test_pipes_of_the_subdivision_hang_together_at_the_inverts_of_their_structur
     line = run.line(0.0)
     station, invert = run.rows(line, 0.5, "x")
     structures = np.interp(line.station, station, invert) / FOOT
-    assert structures == pytest.approx([253.19149, 250.522322, 248.405639, 249.6944, 255.268699, 260.735336], abs=1e-3)
+    assert structures == pytest.approx(
+        [253.19149, 250.522322, 248.405639, 249.6944, 255.268699, 260.735336], abs=1e-3
+    )
 
 
 def test_every_surface_is_read_with_easting_and_northing_in_place(real_data):

@@ -86,7 +86,13 @@ def test_a_spiral_from_a_straight_is_the_fresnel_integral():
 
 @pytest.mark.parametrize(
     "curvature, length",
-    [((0.0, 0.05), 60.0), ((0.05, 0.01), 70.0), ((-0.02, 0.03), 90.0), ((-1 / 500, 0.0), 250.0), ((0.1, 0.15), 18.0)],
+    [
+        ((0.0, 0.05), 60.0),
+        ((0.05, 0.01), 70.0),
+        ((-0.02, 0.03), 90.0),
+        ((-1 / 500, 0.0), 250.0),
+        ((0.1, 0.15), 18.0),
+    ],
 )
 def test_a_spiral_between_two_points_is_the_integral_of_its_curvature(curvature, length):
     end, _ = integrated(2.0, curvature, length, length)
@@ -170,7 +176,10 @@ def test_spirals_that_do_not_fit_are_refused():
     wrong = [
         ({"curvature": -elements["curvature"]}, "meet at an angle of .* are its rot and radii right"),
         ({"curvature": elements["curvature"][:, ::-1]}, "rot and radii right"),
-        ({"spiral_length": elements["spiral_length"] + 0.02}, r"spiral 2 is stated as 80\.020 m long, .* 80\.000 m"),
+        (
+            {"spiral_length": elements["spiral_length"] + 0.02},
+            r"spiral 2 is stated as 80\.020 m long, .* 80\.000 m",
+        ),
         ({"curvature": 30 * elements["curvature"]}, "spiral 2 turns by more than half a circle"),
     ]
     for change, sentence in wrong:

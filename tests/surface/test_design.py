@@ -209,12 +209,28 @@ LINE = "<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>"
 @pytest.mark.parametrize(
     "geometry, length, sentence",
     [
-        (SPIRAL.replace("clothoid", "bloss"), 20, "alignment 'CL' has spirals that are bloss; clothoids are understood"),
+        (
+            SPIRAL.replace("clothoid", "bloss"),
+            20,
+            "alignment 'CL' has spirals that are bloss; clothoids are understood",
+        ),
         (SPIRAL.replace('spiType="clothoid"', ""), 20, "alignment 'CL' has spirals that are of no kind"),
         (SPIRAL.replace('length="20"', ""), 20, "alignment 'CL' has a spiral without length"),
-        (SPIRAL.replace("Spiral", "Clothoid"), 20, "has elements of kind Clothoid; lines, arcs and spirals are"),
-        (SPIRAL.replace('"20"', '"21"'), 20, r"spiral 1 is stated as 21\.000 m long, .* 20\.0\d\d m from its start"),
-        (LINE + "</CoordGeom><StaEquation staBack='110' staAhead='200'/><CoordGeom>", 20, "has station equations"),
+        (
+            SPIRAL.replace("Spiral", "Clothoid"),
+            20,
+            "has elements of kind Clothoid; lines, arcs and spirals are",
+        ),
+        (
+            SPIRAL.replace('"20"', '"21"'),
+            20,
+            r"spiral 1 is stated as 21\.000 m long, .* 20\.0\d\d m from its start",
+        ),
+        (
+            LINE + "</CoordGeom><StaEquation staBack='110' staAhead='200'/><CoordGeom>",
+            20,
+            "has station equations",
+        ),
         (LINE, 21, r"its elements are 20\.000 long, the file says 21\.000"),
         (LINE.replace("Line", "Curve"), 20, "has an arc without Center"),
     ],
@@ -271,7 +287,7 @@ def test_a_missing_or_unreadable_design_is_one_sentence(tmp_path):
 
 # Designs of other kinds: each gives the levels of one closed form, and is refused with its axes swapped.
 
-AXIS = '<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>'
+AXIS = "<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>"
 LEVELS = '<PVI>100 50</PVI><ParaCurve length="8">110 49</ParaCurve><PVI>120 50</PVI>'
 STRUCTS = (
     '<Struct name="A"><Center>4123000 512000</Center><Invert elev="50" flowDir="out" refPipe="p"/></Struct>'
@@ -359,7 +375,9 @@ def test_a_drawing_and_the_same_landxml_say_the_same(tmp_path):
     surface, _ = read_design(xml, site("design.xml", "landxml", start=100.0))
     assert axis.start_station == 100
     station, offset = np.meshgrid(np.linspace(100.1, 119.9, 30), np.linspace(-5, 5, 40))
-    assert np.allclose(drawn.elevation(station, offset), surface.elevation(station, offset), rtol=0, atol=1e-6)
+    assert np.allclose(
+        drawn.elevation(station, offset), surface.elevation(station, offset), rtol=0, atol=1e-6
+    )
     assert np.array_equal(drawn.is_floor(station, offset), surface.is_floor(station, offset))
     assert read_design(*dxf_of(tmp_path, line=False))[0].floor_reach() == pytest.approx(0.5)
 
@@ -380,7 +398,10 @@ def test_a_drawing_without_a_unit_needs_one_in_the_site_file(tmp_path):
 
 @pytest.mark.parametrize("keys", [PROFILE_KEYS, PIPE_KEYS])
 def test_landxml_lines_with_easting_first_are_refused(tmp_path, keys):
-    with pytest.raises(SurfaceError, match="(alignment 'CL'|network 'storm'): lies around .* northing and easting look swapped"):
+    with pytest.raises(
+        SurfaceError,
+        match=r"(alignment 'CL'|network 'storm'): lies around .* northing and easting look swapped",
+    ):
         read_design(*xml_of(tmp_path, keys, change=swapped))
 
 
@@ -393,7 +414,7 @@ def test_a_drawing_with_northing_first_is_refused(tmp_path, line):
 
 def test_pipes_of_another_place_beside_the_alignment_of_the_site_file_are_refused(tmp_path):
     path, _ = xml_of(tmp_path, PIPE_KEYS, change=swapped)
-    with pytest.raises(SurfaceError, match="network 'storm': lies around .* look swapped"):
+    with pytest.raises(SurfaceError, match=r"network 'storm': lies around .* look swapped"):
         read_design(path, site("design.xml", "landxml", more=PIPE_KEYS))
 
 

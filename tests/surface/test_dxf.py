@@ -49,7 +49,9 @@ def net():
 
 def quads():
     corners = net()
-    return np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(-1, 4, 3)
+    return np.stack([corners[:-1, :-1], corners[:-1, 1:], corners[1:, 1:], corners[1:, :-1]], axis=2).reshape(
+        -1, 4, 3
+    )
 
 
 def as_triangles(space):
@@ -154,7 +156,14 @@ def finely_drawn(*entities):
     return shapely.MultiLineString(lines)
 
 
-BULGED = [(E, N, 0.0), (E + 20, N, 0.4), (E + 30, N + 10, -0.25), (E + 50, N + 12, 1.2), (E + 50, N + 30, 0.0), (E, N + 60, 0)]
+BULGED = [
+    (E, N, 0.0),
+    (E + 20, N, 0.4),
+    (E + 30, N + 10, -0.25),
+    (E + 50, N + 12, 1.2),
+    (E + 50, N + 30, 0.0),
+    (E, N + 60, 0),
+]
 
 
 @pytest.mark.parametrize("kind", ["lwpolyline", "polyline2d"])
@@ -196,7 +205,9 @@ def test_lines_and_arcs_in_any_order_are_joined_in_the_direction_they_are_drawn(
     wanted = [[E, N], [E + 30, N + 40]]
     assert ends == pytest.approx(np.array(wanted[::-1] if turned else wanted))
     middle = alignment.points(0.5 * (alignment.station[1] + alignment.station[2]), 0.0)
-    assert middle == pytest.approx([arc.dxf.center.x + 10 * math.sqrt(0.5), arc.dxf.center.y - 10 * math.sqrt(0.5)])
+    assert middle == pytest.approx(
+        [arc.dxf.center.x + 10 * math.sqrt(0.5), arc.dxf.center.y - 10 * math.sqrt(0.5)]
+    )
 
 
 def test_an_arc_seen_from_below_is_where_ezdxf_draws_it(tmp_path):
@@ -268,11 +279,15 @@ def test_what_a_layer_holds_instead_of_faces_is_said(tmp_path):
     block.add_3dface(quads()[0], dxfattribs={"layer": "hidden"})
     space.add_blockref("tin", (0, 0), dxfattribs={"layer": "0"})
     path = saved(doc, tmp_path)
-    with pytest.raises(SurfaceError, match="layer 'break' has no faces .* it holds 1 LINE; export"):
+    with pytest.raises(SurfaceError, match=r"layer 'break' has no faces .* it holds 1 LINE; export"):
         read_dxf(path, "break", None)
-    with pytest.raises(SurfaceError, match="layer 'hidden' has no faces .* stands inside blocks: explode them"):
+    with pytest.raises(
+        SurfaceError, match=r"layer 'hidden' has no faces .* stands inside blocks: explode them"
+    ):
         read_dxf(path, "hidden", None)
-    with pytest.raises(SurfaceError, match="layer 'x' has no faces .* entities on '0', 'break', 'trench floor'"):
+    with pytest.raises(
+        SurfaceError, match=r"layer 'x' has no faces .* entities on '0', 'break', 'trench floor'"
+    ):
         read_dxf(path, "x", None)
 
 
@@ -327,7 +342,11 @@ def entities(body, end="0\nENDSEC\n0\nEOF\n"):
 
 def test_the_smallest_drawing_is_read_and_says_no_unit(tmp_path):
     path = tmp_path / "d.dxf"
-    for text in (entities(FACE), entities(FACE).replace("\n", "\r\n"), "999\nmade by hand\n" + entities(FACE) + "\x1a"):
+    for text in (
+        entities(FACE),
+        entities(FACE).replace("\n", "\r\n"),
+        "999\nmade by hand\n" + entities(FACE) + "\x1a",
+    ):
         path.write_bytes(text.encode())
         found = read_dxf(path, "f", None)
         assert len(found.surface.faces) == 1 and found.unit_code == 0
@@ -368,7 +387,7 @@ def test_what_is_no_drawing_or_may_be_hostile_is_refused_in_one_sentence(tmp_pat
 
 
 def test_a_missing_file_is_one_sentence(tmp_path):
-    with pytest.raises(SurfaceError, match="no.dxf: cannot be read .* beside site.toml"):
+    with pytest.raises(SurfaceError, match=r"no.dxf: cannot be read .* beside site.toml"):
         read_dxf(tmp_path / "no.dxf", "f", None)
 
 

@@ -1,5 +1,6 @@
 """LandXML beyond surfaces: spirals, chains, references, profiles and pipes; bounds hold for them too."""
 
+import itertools
 import math
 
 import pytest
@@ -16,7 +17,8 @@ POINTS = """<CgPoints name="all"><CgPoints name="inner"><CgPoint name="1">100. 5
 <CgPoint name="2">110. 5.<Feature code="x"><Property label="a" value="b"/></Feature></CgPoint>
 <CgPoint name="two" pntRef="2"/><CgPoint name="3">120 25</CgPoint></CgPoints></CgPoints>"""
 PROFILE = """<Profile name="road"><ProfAlign name="floor"><PVI>0 10</PVI><ParaCurve length="20">50 12</ParaCurve>
-<UnsymParaCurve lengthIn="5" lengthOut="8">80 11</UnsymParaCurve><CircCurve length="9.5" radius="-300">120 13</CircCurve>
+<UnsymParaCurve lengthIn="5" lengthOut="8">80 11</UnsymParaCurve>
+<CircCurve length="9.5" radius="-300">120 13</CircCurve>
 <PVI>200 12</PVI></ProfAlign>
 <ProfSurf name="ground"><PntList2D>0 14 100 15.5 200 14</PntList2D></ProfSurf></Profile>"""
 NETWORK = """<PipeNetworks><PipeNetwork name="storm" pipeNetType="storm">
@@ -29,9 +31,8 @@ NETWORK = """<PipeNetworks><PipeNetwork name="storm" pipeNetType="storm">
 
 
 def alignment(geometry, more=""):
-    return (
-        f'<Alignments><Alignment name="CL" staStart="100"><CoordGeom>{geometry}</CoordGeom>{more}</Alignment></Alignments>'
-    )
+    line = f'<Alignment name="CL" staStart="100"><CoordGeom>{geometry}</CoordGeom>{more}</Alignment>'
+    return f"<Alignments>{line}</Alignments>"
 
 
 def read(tmp_path, body, units=METRES):
@@ -64,7 +65,10 @@ def test_points_may_be_named_before_or_after_and_through_one_another(tmp_path):
 
 def test_chains_and_irregular_lines_are_polylines(tmp_path):
     chain = read(tmp_path, alignment("<Chain>1 2 3</Chain>") + POINTS).alignment(None).elements
-    assert [(e.kind, e.start, e.end) for e in chain] == [("Line", (5, 100), (5, 110)), ("Line", (5, 110), (25, 120))]
+    assert [(e.kind, e.start, e.end) for e in chain] == [
+        ("Line", (5, 100), (5, 110)),
+        ("Line", (5, 110), (25, 120)),
+    ]
     for listed in ("<PntList2D>0 0 10 1 20 3</PntList2D>", "<PntList3D>0 0 9 10 1 9 20 3 9</PntList3D>"):
         body = f"<IrregularLine><Start>0 0</Start><End>30 3</End>{listed}</IrregularLine>"
         elements = read(tmp_path, alignment(body)).alignment(None).elements
@@ -73,7 +77,9 @@ def test_chains_and_irregular_lines_are_polylines(tmp_path):
 
 
 def test_profiles_keep_their_curves(tmp_path):
-    line = read(tmp_path, alignment("<Line><Start>0 0</Start><End>200 0</End></Line>", PROFILE)).alignment(None)
+    line = read(tmp_path, alignment("<Line><Start>0 0</Start><End>200 0</End></Line>", PROFILE)).alignment(
+        None
+    )
     floor = profile_named(line, "floor", "design.xml")
     assert [(v.kind, v.station, v.elevation) for v in floor.vertices] == [
         ("PVI", 0, 10), ("ParaCurve", 50, 12), ("UnsymParaCurve", 80, 11), ("CircCurve", 120, 13), ("PVI", 200, 12),
@@ -83,7 +89,9 @@ def test_profiles_keep_their_curves(tmp_path):
     assert (floor.vertices[3].radius, floor.vertices[3].length) == (-300, 9.5)
     ground = profile_named(line, "ground", "design.xml")
     assert (ground.kind, [v.elevation for v in ground.vertices]) == ("ProfSurf", [14, 15.5, 14])
-    with pytest.raises(SurfaceError, match="has no profile 'x'; it holds 'floor', 'ground'; mend design.profile"):
+    with pytest.raises(
+        SurfaceError, match=r"has no profile 'x'; it holds 'floor', 'ground'; mend design.profile"
+    ):
         profile_named(line, "x", "design.xml")
 
 
@@ -117,11 +125,13 @@ def test_diameters_are_in_the_linear_unit_or_unknown(tmp_path, units, diameter):
 
 
 def test_a_curved_pipe_is_chords_within_a_millimetre_of_its_arc(tmp_path):
-    curved = NETWORK.replace('<CircPipe diameter="300" material="x"/>', '<CircPipe diameter="300"/><Center>120 5</Center>')
+    curved = NETWORK.replace(
+        '<CircPipe diameter="300" material="x"/>', '<CircPipe diameter="300"/><Center>120 5</Center>'
+    )
     pipes = [pipe for pipe in read(tmp_path, curved + POINTS).pipes if pipe.name == "p"]
     assert len(pipes) > 20
     assert (pipes[0].start, pipes[-1].end) == ((5, 100, 50), (25, 120, 49.6))
-    for a, b in zip(pipes, pipes[1:], strict=False):
+    for a, b in itertools.pairwise(pipes):
         assert a.end == b.start
     for pipe in pipes:
         middle = [(s + t) / 2 for s, t in zip(pipe.start, pipe.end, strict=True)]
@@ -135,8 +145,16 @@ def test_a_curved_pipe_is_chords_within_a_millimetre_of_its_arc(tmp_path):
     [
         ('refEnd="B"', 'refEnd="Z"', "pipe 'p' of network 'storm' ends at structure 'Z', which is not there"),
         ("<Center>100 5</Center>", "", "structure 'A', which is not there or has no Center"),
-        ('elev="49.6" flowDir="in" refPipe="p"', 'elev="49.6" flowDir="in" refPipe="x"', "at structure 'B' no invert"),
-        ('elev="49.5" flowDir="out" refPipe="q"', 'elev="49.5" flowDir="in" refPipe="p"', "'B' 2 invert elevations"),
+        (
+            'elev="49.6" flowDir="in" refPipe="p"',
+            'elev="49.6" flowDir="in" refPipe="x"',
+            "at structure 'B' no invert",
+        ),
+        (
+            'elev="49.5" flowDir="out" refPipe="q"',
+            'elev="49.5" flowDir="in" refPipe="p"',
+            "'B' 2 invert elevations",
+        ),
         ('pntRef="3"', 'pntRef="33"', "structure 'B' refers to point '33', which the file does not hold"),
     ],
 )
@@ -161,8 +179,8 @@ LINE = "<Line><Start>0 0</Start><End>200 0</End></Line>"
          "refers to point 'a', of which there are several"),
         (alignment('<Chain>a b</Chain><CgPoints><CgPoint name="a" pntRef="b"/></CgPoints>'), "refers to point"),
         (alignment(LINE) + '<CgPoints><CgPoint name="a">1 x</CgPoint></CgPoints>', "point 'a': expected 2 numbers"),
-        (alignment("<IrregularLine><PntList3D>1 2 3 4</PntList3D></IrregularLine>"), "has 4 numbers, which are no points"),
-        (alignment(LINE, PROFILE.replace('length="20"', "")), "a ParaCurve of profile 'floor' at station 50 has no length"),
+        (alignment("<IrregularLine><PntList3D>1 2 3 4</PntList3D></IrregularLine>"), "has 4 numbers, which"),
+        (alignment(LINE, PROFILE.replace('length="20"', "")), "a ParaCurve .* at station 50 has no length"),
         (alignment(LINE, PROFILE.replace('radius="-300"', "")), "a CircCurve .* has no radius"),
         (alignment(LINE, PROFILE.replace("80 11", "80")), "a UnsymParaCurve of profile 'floor': expected 2 numbers"),
         (alignment(LINE, PROFILE.replace("0 14 100", "14 100")), "the list of profile 'ground' has 5 numbers"),
@@ -181,11 +199,21 @@ def test_what_makes_no_sense_or_may_be_hostile_is_refused_in_one_sentence(tmp_pa
 
 def test_points_that_refer_to_each_other_end(tmp_path):
     ring = '<CgPoints><CgPoint name="a" pntRef="b"/><CgPoint name="b" pntRef="a"/></CgPoints>'
-    refused(tmp_path, alignment("<Chain>a b</Chain>") + ring, "refers to point '[ab]', which the file does not hold")
+    refused(
+        tmp_path,
+        alignment("<Chain>a b</Chain>") + ring,
+        "refers to point '[ab]', which the file does not hold",
+    )
 
 
 @pytest.mark.parametrize(
-    "body", [alignment(LINE * 9), alignment(LINE, PROFILE), NETWORK + POINTS, POINTS + alignment("<Chain>1 2</Chain>")]
+    "body",
+    [
+        alignment(LINE * 9),
+        alignment(LINE, PROFILE),
+        NETWORK + POINTS,
+        POINTS + alignment("<Chain>1 2</Chain>"),
+    ],
 )
 def test_records_are_counted(tmp_path, monkeypatch, body):
     monkeypatch.setattr(landxml_section, "MAX_RECORDS", 2)
@@ -193,8 +221,8 @@ def test_records_are_counted(tmp_path, monkeypatch, body):
 
 
 def test_misplaced_parts_of_a_hostile_file_are_passed_over_or_refused_and_never_crash(tmp_path):
-    odd = "<Alignment><CoordGeom><Line><Alignment><CoordGeom><Feature><Start>1 1</Start></Feature></CoordGeom></Alignment>"
-    odd += "</Line></CoordGeom></Alignment>"
+    odd = "<Alignment><CoordGeom><Line><Alignment><CoordGeom><Feature><Start>1 1</Start></Feature>"
+    odd += "</CoordGeom></Alignment></Line></CoordGeom></Alignment>"
     refused(tmp_path, odd, "a Line of alignment '' has no Start or no End")
     odd = "<Surfaces><F>1</F><P>2</P><Definition/></Surfaces><PipeNetworks><Invert/>"
     odd += "<Pipe/><Center>1 1</Center></PipeNetworks><Profile><PVI>x</PVI></Profile>"

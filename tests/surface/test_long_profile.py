@@ -49,10 +49,14 @@ def test_an_unsymmetrical_parabola_meets_under_its_point_with_one_tangent():
 
 def test_a_circle_touches_both_gradients_and_all_its_points_are_a_radius_from_its_centre():
     for sign in (1, -1):
-        line = profile(pvi(0, 50), circle(200, 50 - sign * 16, -700.0), pvi(400, 50))  # the sign is the gradients'
+        line = profile(
+            pvi(0, 50), circle(200, 50 - sign * 16, -700.0), pvi(400, 50)
+        )  # the sign is the gradients'
         incline = np.arctan(16 / 200)
         tangent = 700 * np.tan(incline)
-        first = np.array([200, 50 - sign * 16]) + tangent * np.array([-np.cos(incline), sign * np.sin(incline)])
+        first = np.array([200, 50 - sign * 16]) + tangent * np.array(
+            [-np.cos(incline), sign * np.sin(incline)]
+        )
         center = np.array([200, first[1] + sign * 700 * np.cos(incline)])
         station = np.linspace(first[0], 400 - first[0], 101)
         away = np.hypot(station - center[0], line.elevation(station) - center[1])
@@ -101,7 +105,8 @@ def test_feet_become_metres_and_outside_there_is_nothing():
     [
         ((pvi(0, 5),), "has one point only"),
         ((pvi(0, 5), pvi(0, 6), pvi(9, 5)), "stations must grow .* 0 follows 0"),
-        ((pvi(0, 5), parabola(40, 4, 30), parabola(90, 6, 25), pvi(200, 5)), r"the curves at stations 40 and 90 overlap by 5\.000"),
+        ((pvi(0, 5), parabola(40, 4, 30), parabola(90, 6, 25), pvi(200, 5)),
+         r"the curves at stations 40 and 90 overlap by 5\.000"),
         ((parabola(0, 5, 10), pvi(50, 6)), "its first point is a ParaCurve"),
         ((pvi(0, 5), circle(50, 6, 100.0)), "its last point is a CircCurve"),
         ((pvi(0, 5), circle(50, 6, 400.0, 9.0), pvi(100, 5)), r"station 50 is stated as 9\.000 long, .* 15\.998"),

@@ -68,7 +68,12 @@ def test_feet_become_metres():
         (RUN, (), "sewer", "has no pipe network 'sewer'; it holds 'storm'"),
         ((), (), "sewer", "it holds none with pipes"),
         (RUN, ("p", "x"), "storm", "network 'storm' has no pipe 'x'"),
-        ((*RUN, pipe("s", B, (30.0, -20.0), (49.6, 49.0))), (), "storm", "pipes 'p', 'q', 's' meet .*design.pipe_run"),
+        (
+            (*RUN, pipe("s", B, (30.0, -20.0), (49.6, 49.0))),
+            (),
+            "storm",
+            "pipes 'p', 'q', 's' meet .*design.pipe_run",
+        ),
         (RUN, ("p", "r"), "storm", "make 2 separate lines"),
         ((*RUN[:2], pipe("z", C, A, (49.2, 50.0))), (), "storm", "make no separate lines with two ends"),
     ],
