@@ -35,7 +35,7 @@ class Alignment:
     center: np.ndarray
     """(m, 2) of the arc's centre; nan for a line and for a spiral."""
     turn: np.ndarray
-    """(m,) -1 turns left (counter-clockwise), +1 turns right (clockwise), 0 is a straight line."""
+    """(m,) -1 turns left (counter-clockwise), +1 turns right (clockwise), 0 is a straight line. Spirals turn too."""
     station: np.ndarray
     """(m + 1,) stations of the elements' borders, metres."""
     name: str = ""

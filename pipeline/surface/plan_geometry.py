@@ -73,3 +73,35 @@ def _curvature(element: XmlElement) -> tuple[float, float]:
         return np.nan, np.nan
     sign = _turn(element)
     return sign / element.radii[0], sign / element.radii[1]
+
+
+def without_spirals(line: Alignment, error_m: float) -> Alignment:
+    """The same line with chords in place of its spirals, for formats and readers that know none.
+
+    Parameters
+    ----------
+    line : Alignment
+        Lines and arcs of it stay as they are, and so do all stations.
+    error_m : float
+        How far a chord may leave its spiral.
+    """
+    if line.curvature is None:
+        return line
+    borders: list[np.ndarray] = []
+    for k, bend in enumerate(np.abs(line.curvature)):
+        first, last = line.station[k], line.station[k + 1]
+        chords = 1
+        if np.isfinite(bend[0]):
+            chords = max(1, int(np.ceil((last - first) * np.sqrt(bend.max() / (8 * error_m)))))
+        borders.append(np.linspace(first, last, chords, endpoint=False))
+    count = np.array([len(part) for part in borders])
+    owner = np.repeat(np.arange(len(count)), count)
+    station = np.append(np.concatenate(borders), line.station[-1])
+    corners = line.points(station, 0.0)
+    # Elements that stay keep their ends to the last digit.
+    start, end = corners[:-1], corners[1:]
+    alone = count[owner] == 1
+    start[alone], end[alone] = line.start[owner[alone]], line.end[owner[alone]]
+    spiral = np.isfinite(line.curvature[owner, 0])
+    turn = np.where(spiral, 0, line.turn[owner]).astype(line.turn.dtype)
+    return Alignment(start, end, line.center[owner], turn, station, line.name)

@@ -11,6 +11,7 @@ from scipy.special import fresnel
 from pipeline.errors import SurfaceError
 from pipeline.surface.alignment import from_elements
 from pipeline.surface.clothoid import clothoid_to
+from pipeline.surface.plan_geometry import without_spirals
 
 FAR = np.array([21_530_239.0, 6_782_560.0])
 NAN = np.nan
@@ -169,6 +170,19 @@ def test_near_the_centre_of_curvature_the_search_still_ends_at_the_nearest_point
     least = np.min(np.linalg.norm(fine[None] - p[:, None], axis=2), axis=1)
     found, _ = spiral.walk(spiral.nearest(p))
     assert np.all(np.linalg.norm(found - p, axis=1) < least + 1e-3)
+
+
+def test_chords_in_place_of_spirals_keep_to_the_line_and_to_its_stations():
+    line, _ = alignment()
+    plain = without_spirals(line, 1e-4)
+    assert plain.curvature is None and len(plain.turn) > 30
+    station = np.linspace(1000, 1260, 5001)
+    away = np.linalg.norm(plain.points(station, 0.0) - line.points(station, 0.0), axis=1)
+    assert 2e-5 < away.max() < 1.05e-4
+    assert np.count_nonzero(plain.turn) == 1  # the arc is an arc still
+    assert np.array_equal(plain.end[:-1], plain.start[1:])
+    assert np.array_equal(plain.start[[0]], line.start[[0]]) and set(line.station) <= set(plain.station)
+    assert without_spirals(plain, 1e-4) is plain
 
 
 def test_spirals_that_do_not_fit_are_refused():

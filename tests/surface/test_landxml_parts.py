@@ -103,6 +103,17 @@ def test_profiles_go_with_the_alignment_they_stand_in(tmp_path):
     assert found.alignment("bare").profiles == ()
 
 
+def test_of_two_inverts_for_one_pipe_the_flow_tells_which_end_is_meant(tmp_path):
+    both = NETWORK.replace(
+        'flowDir="in" refPipe="q"', 'flowDir="in" refPipe="q"/><Invert elev="48" flowDir="out" refPipe="q"'
+    )
+    both = both.replace(
+        'flowDir="out" refPipe="p"', 'flowDir="out" refPipe="p"/><Invert elev="51" flowDir="in" refPipe="p"'
+    )
+    p, q = read(tmp_path, both + POINTS).pipes
+    assert (p.start[2], q.end[2]) == (50, 49.1)
+
+
 def test_pipes_lie_at_the_inverts_of_their_structures(tmp_path):
     p, q = read(tmp_path, NETWORK + POINTS).pipes
     assert (p.network, p.name, p.start, p.end) == ("storm", "p", (5, 100, 50), (25, 120, 49.6))
