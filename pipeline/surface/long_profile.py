@@ -18,7 +18,7 @@ from pipeline.surface.landxml_profiles import XmlProfile, XmlVertex
 
 _OVERLAP_M = 0.001
 _CHORD_M = 1e-6
-_MAX_ROWS = 1_000_000
+_MAX_ROWS = 5_000_000
 _LENGTH_SHARE = 0.01
 """How far the stated length of a circle may be from the one its radius makes: chord, arc and run differ by less."""
 
@@ -47,15 +47,25 @@ class LongProfile:
         return self._at(station)[1]
 
     def rows(self) -> tuple[np.ndarray, np.ndarray]:
-        """Stations and elevations (n,), so close that straight lines between them are right to a micrometre."""
-        stations = []
+        """Stations and elevations (n,), so close that straight lines between them are right to a micrometre.
+
+        Raises SurfaceError where that takes millions of rows: no trench is that long.
+        """
+        stations: list[np.ndarray] = []
+        rows = 0
         for k in range(len(self.level)):
             first, last = self.station[k], self.station[k + 1]
             # A chord of a curve that bends by c a metre leaves it by c s^2 / 8; a circle bends by (1 + g^2)^1.5 / R.
             steep = max(1.0, *(1 + self.slope(np.array([first, last])) ** 2)) ** 1.5
             bend = max(abs(self.growth[k]), 0.0 if np.isnan(self.radius[k]) else steep / abs(self.radius[k]))
             count = max(1, math.ceil((last - first) / math.sqrt(8 * _CHORD_M / bend))) if bend > 0 else 1
-            stations.append(np.linspace(first, last, min(count, _MAX_ROWS), endpoint=False))
+            rows += count
+            if rows > _MAX_ROWS:
+                raise SurfaceError(
+                    f"a profile of {(self.station[-1] - self.station[0]) / 1000:.0f} km is too long to be followed; "
+                    "cut it down to the job"
+                )
+            stations.append(np.linspace(first, last, count, endpoint=False))
         station = np.concatenate([*stations, self.station[-1:]])
         return station, self.elevation(station)
 

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.errors import SurfaceError
 from pipeline.surface.alignment import Alignment, polyline
 from pipeline.surface.landxml_pipes import XmlPipe
+from pipeline.surface.plan_geometry import MAX_LENGTH_M
 
 _STEP_M = 1e-6
 """Two inverts at one manhole are two rows of a profile, and its stations must grow."""
@@ -123,6 +124,12 @@ def run_of(
             (pipe for pipe in own if pipe.name in set(names)), key=lambda pipe: list(names).index(pipe.name)
         )
     ends = [np.array([pipe.start, pipe.end]) * scale for pipe in own]
+    length = sum(float(np.hypot(*(pair[1] - pair[0])[:2])) for pair in ends)
+    if not length <= MAX_LENGTH_M:
+        raise SurfaceError(
+            f"{source}: the pipes of network '{network}' are {length / 1000:.0f} km long in all; name those of this "
+            "job with design.pipe_run"
+        )
     order = _in_order(ends, [pipe.name for pipe in own], f"{source}: network '{network}'")
     return PipeRun(
         network,

@@ -8,6 +8,8 @@ from pipeline.errors import SurfaceError
 from pipeline.surface.alignment import Alignment, from_elements
 from pipeline.surface.landxml_alignments import XmlAlignment, XmlElement
 
+MAX_LENGTH_M = 1_000_000.0
+"""Of an alignment: it is sampled every 0.25 m, and a wrong number in a file must not ask for all memory."""
 _LENGTH_M = 0.05
 """How far the stated length of an alignment may be from that of its elements; rounding adds up over many of them."""
 
@@ -48,10 +50,14 @@ def alignment_of(element: XmlAlignment, source: str, scale: float) -> Alignment:
         np.array([e.center if e.kind == "Curve" and e.center else nowhere for e in element.elements]) * scale,
         np.array([_turn(e) for e in element.elements]),
         element.start_station * scale,
-        f"{element.name}",
+        element.name,
         curvature=np.array([_curvature(e) for e in element.elements]) / scale if spiral else None,
         spiral_length=np.array([np.nan if e.length is None else e.length * scale for e in element.elements]),
     )
+    if not alignment.length <= MAX_LENGTH_M:
+        raise SurfaceError(
+            f"{where} is {alignment.length / 1000:,.0f} km long; cut it down to the job, or is a coordinate wrong?"
+        )
     if (
         element.stated_length is not None
         and abs(alignment.length - element.stated_length * scale) > _LENGTH_M

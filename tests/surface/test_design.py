@@ -233,6 +233,7 @@ LINE = "<Line><Start>4123000 512000</Start><End>4123020 512000</End></Line>"
         ),
         (LINE, 21, r"its elements are 20\.000 long, the file says 21\.000"),
         (LINE.replace("Line", "Curve"), 20, "has an arc without Center"),
+        (LINE.replace("4123020", "4e9"), 20, r"is 3,\d{3},877 km long; cut it down to the job"),
     ],
 )
 def test_an_alignment_that_cannot_be_followed_is_refused(tmp_path, geometry, length, sentence):

@@ -118,6 +118,12 @@ def test_profiles_that_make_no_sense_are_refused(vertices, sentence):
         profile(*vertices)
 
 
+def test_a_wrong_number_does_not_ask_for_all_memory():
+    far = profile(pvi(0, 5), parabola(2e9, 5, 1e9), pvi(4e9, 1e9))
+    with pytest.raises(SurfaceError, match="a profile of 4000000 km is too long"):
+        far.rows()
+
+
 def test_a_profile_with_gaps_is_refused():
     with pytest.raises(SurfaceError, match="has 2 separate stretches"):
         profile(pvi(0, 5), pvi(9, 5), gaps=1)

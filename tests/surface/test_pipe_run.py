@@ -96,3 +96,8 @@ def test_pipes_beside_the_alignment_or_back_along_it_are_refused():
     bent = run([pipe("p", A, B, (50, 49)), pipe("q", B, (5.0, 0.3), (49, 48))])
     with pytest.raises(SurfaceError, match="turn back along the alignment"):
         bent.rows(polyline(np.array([[0.0, 0.0], [100.0, 0.0]])), 1.0, "x")
+
+
+def test_a_wrong_coordinate_does_not_ask_for_all_memory():
+    with pytest.raises(SurfaceError, match="the pipes of network 'storm' are 2000000 km long in all"):
+        run([pipe("p", A, (2e9, 0.0), (50, 49))])
