@@ -31,12 +31,15 @@ from pipeline.report.attention import attention
 from pipeline.report.consistency import consistency
 from pipeline.report.drawing import house_style, svg_of
 from pipeline.report.evidence import Timeline
+from pipeline.report.hand_off import AS_BUILT_POINTS, files_table, hand_off_of, points_table
+from pipeline.report.identity import identity, settings
 from pipeline.report.inputs import ReportInputs
 from pipeline.report.provenance import method, provenance
 from pipeline.report.units import Units, text_of, units_of
 from pipeline.report.words import Words
 from pipeline.resources import template_folder
 from pipeline.surface.checks import ENOUGH
+from pipeline.surface.hand_off import HandOff
 
 FORMAT = "gradetrace/report/1"
 
@@ -49,7 +52,9 @@ class Page:
     content: dict[str, Any]
     """report.json."""
     exports: dict[str, dict[str, Any]]
-    """Whole tables for CSV files: ``stations``, ``checks``; only those that there are."""
+    """Whole tables for CSV files: ``stations``, ``checks``, ``as_built_pnezd``; only those that there are."""
+    hand_off: HandOff | None
+    """What the drawings hold; None where there is no alignment."""
 
 
 def render(inputs: ReportInputs, language: str = "en") -> Page:
@@ -57,6 +62,11 @@ def render(inputs: ReportInputs, language: str = "en") -> Page:
     words = Words(language)
     units = units_of(inputs.site.grid.unit, inputs.site.grid.metres_per_unit)
     content, pictures = compose(inputs, units, words)
+    exports, hand_off = _exports(inputs, units, words), hand_off_of(inputs, units)
+    content["hand_off"] = {
+        "files": files_table(exports, hand_off is not None, words),
+        "as_built_points": exports.get(AS_BUILT_POINTS),
+    }
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(template_folder()),
         autoescape=True,
@@ -68,7 +78,7 @@ def render(inputs: ReportInputs, language: str = "en") -> Page:
     style = Markup((template_folder() / "style.css").read_text(encoding="utf-8"))
     svg = {name: Markup(text) for name, text in pictures.items()}
     html = environment.get_template("report.html").render(page=content, svg=svg, w=words, style=style)
-    return Page(html, content, _exports(inputs, units, words))
+    return Page(html, content, exports, hand_off)
 
 
 def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str, Any], dict[str, str]]:
@@ -110,6 +120,8 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         **evidence.statics(inputs, words),
         "method": method(inputs, units, words),
         "provenance": provenance(inputs, words),
+        "identity": identity(inputs, units),
+        "settings": settings(inputs),
     }
     content["missing"] = {
         name: words("page.not_available", why=inputs.why_missing(name))
@@ -125,6 +137,8 @@ def _exports(inputs: ReportInputs, units: Units, words: Words) -> dict[str, dict
         found["stations"] = measured.stations_table(stations, units, words, whole=True)
     if (checks := inputs.table("checks")) is not None:
         found["checks"] = measured.checks_table(checks, units, words, whole=True)
+    if (points := points_table(inputs, units, words)) is not None:
+        found[AS_BUILT_POINTS] = points
     return found
 
 

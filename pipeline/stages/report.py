@@ -12,9 +12,12 @@ from pipeline import __version__
 from pipeline.errors import ArtefactError
 from pipeline.report import FileSource, ReportInputs, render
 from pipeline.report.exports import csv_of
+from pipeline.report.hand_off import AS_BUILT_POINTS, DXF, LANDXML
 from pipeline.stages import STAGES
 from pipeline.stages.job import Counts, Job, Progress, Source
 from pipeline.surface.design import read_design
+from pipeline.surface.drawing_exchange import dxf_bytes
+from pipeline.surface.landxml_out import landxml_bytes
 
 COLUMNS: dict[str, list[str] | None] = {
     "frames": ["camera", "time_ns"],
@@ -42,8 +45,8 @@ LIBRARIES = (
 
 
 def run(job: Job, progress: Progress) -> Counts:
-    """Write `report.html`, `report.json`, `stations.csv` and `checks.csv`."""
-    progress.total(3, "steps")
+    """Write `report.html`, `report.json`, `stations.csv`, `checks.csv` and the as-built points, LandXML and DXF."""
+    progress.total(4, "steps")
     inputs = gather(job)
     progress.advance()
     page = render(inputs)
@@ -52,7 +55,11 @@ def run(job: Job, progress: Progress) -> Counts:
     job.write_bytes("report.html", html)
     job.write_json("report.json", page.content)
     for name, table in page.exports.items():
-        job.write_bytes(f"{name}.csv", csv_of(table))
+        job.write_bytes(f"{name}.csv", csv_of(table, heading=name != AS_BUILT_POINTS))
+    progress.advance()
+    if page.hand_off is not None:
+        job.write_bytes(LANDXML, landxml_bytes(page.hand_off))
+        job.write_bytes(DXF, dxf_bytes(page.hand_off))
     progress.advance()
     return {
         "verdict": page.content["verdict"]["word"],
