@@ -1,10 +1,10 @@
 """What leaves the house as a drawing: the as-built surface as triangles, points of the floor, the long profile.
 
-* **Surface**: corners are the centres of cells that were cut, at their own elevations; faces join only cells that lie
-  side by side. A cell that was not cut leaves a hole, and no face reaches across it. Where that would make more than
-  `MAX_FACES` faces only every k-th row of cells along the alignment keeps its corners (of wide surfaces every so many
-  columns too), and a face stands only where every cell that it covers was cut: thinning can make a gap wider and
-  never narrower.
+* **Surface**: corners are the centres of cells that were cut and hang together, side by side, with the cut floor, at
+  their own elevations; faces join only cells that lie side by side. A cell that was not cut leaves a hole, and no
+  face reaches across it. Where that would make more than `MAX_FACES` faces only every k-th row of cells along the
+  alignment keeps its corners (of wide surfaces every so many columns too), and a face stands only where every cell
+  that it covers was cut: thinning can make a gap wider and never narrower.
 * **Points**: three per station that was reached, on the floor as it was cut: its left edge, its middle, its right edge.
 * **Profile**: the mean floor of the stations that were reached, in stretches without a gap.
 
@@ -16,6 +16,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import label
 
 from pipeline.surface.alignment import Alignment
 
@@ -110,6 +111,9 @@ def mesh_of_cells(cells: CutCells, alignment: Alignment, max_faces: int = MAX_FA
     column = np.round((cells.offset - cells.offset.min()) / cells.cell_m).astype(np.int64)
     index = np.full((row.max() + 1, column.max() + 1), -1, np.int32)
     index[row, column] = np.arange(len(cells))
+    # The edge crosses the designed slopes in the air above the ground too; nothing joins such scraps to the floor.
+    patch, _ = label(index >= 0)
+    index[~np.isin(patch, patch[row[cells.floor], column[cells.floor]])] = -1
     # Sums from the first cell on tell of any block of cells whether all of it was cut.
     total = np.zeros((index.shape[0] + 1, index.shape[1] + 1), np.int32)
     total[1:, 1:] = np.cumsum(np.cumsum(index >= 0, axis=0, dtype=np.int32), axis=1)
