@@ -140,7 +140,7 @@ def floor_points(
     A station lies as often on the border of two rows of cells as inside one. At each offset the point is the mean,
     in place and elevation, of the cut cells that touch the station there; the outermost offsets are the edges, and
     the one nearest to half-way between them is the middle. Where only one or two offsets were cut there are no more
-    points than that.
+    points than that, and none where the cut cells that a station stands for end short of it.
 
     Parameters
     ----------
