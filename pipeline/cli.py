@@ -165,6 +165,33 @@ def check(log: Path, machine: Path | None, site: Path | None) -> None:
 
 
 @main.command()
+@click.argument("a", metavar="A", type=click.Path(path_type=Path))
+@click.argument("b", metavar="B", type=click.Path(path_type=Path))
+@click.option("--json", "as_json", is_flag=True, help="Print everything as JSON instead of a table.")
+def diff(a: Path, b: Path, as_json: bool) -> None:
+    """Compare two reports of one job, station by station: B minus A.
+
+    A and B are run folders (runs/LOG) or report.json files: of two days, or of one log with another calibration.
+    Ends with 3 where they are not of one job.
+    """
+    from pipeline.report.difference import as_dict, compare_reports, sentences, table_of
+    from pipeline.report.report_file import read_report
+
+    found = compare_reports(read_report(a), read_report(b))
+    if as_json:
+        from pipeline.runs import json_bytes
+
+        click.echo(json_bytes(as_dict(found)).decode("utf-8"), nl=False)
+        return
+    for name, report in (("A", found.a), ("B", found.b)):
+        log = report.files.get("log", ("unknown", ""))[0]
+        click.echo(f"{name}: {report.source}, log {log}, verdict {report.verdict}")
+    _print_table(*table_of(found))
+    for line in sentences(found):
+        click.echo(line)
+
+
+@main.command()
 @click.argument("machine", metavar="MACHINE", type=click.Path(path_type=Path))
 @click.argument("site", metavar="SITE", type=click.Path(path_type=Path))
 @click.option(

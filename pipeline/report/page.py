@@ -35,13 +35,12 @@ from pipeline.report.hand_off import AS_BUILT_POINTS, files_table, hand_off_of, 
 from pipeline.report.identity import identity, settings
 from pipeline.report.inputs import ReportInputs
 from pipeline.report.provenance import method, provenance
+from pipeline.report.report_file import FORMAT
 from pipeline.report.units import Units, text_of, units_of
 from pipeline.report.words import Words
 from pipeline.resources import template_folder
 from pipeline.surface.checks import ENOUGH
 from pipeline.surface.hand_off import HandOff
-
-FORMAT = "gradetrace/report/1"
 
 
 @dataclass(frozen=True)
