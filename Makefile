@@ -17,18 +17,45 @@ export UV_SYSTEM_CERTS ?= true
 MAKEFLAGS += --silent --no-print-directory
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help report log-is-named setup test test-all check format schemas sample-logs bench clean lock
+.PHONY: help report pdf log-is-named setup test test-all check format schemas sample-logs bench clean lock
 
 help: ## What can be made
 	echo "gradetrace: from the log of an excavator's cameras to a trench report"
 	echo
-	awk -F ':.*## ' '/^[a-z%-]+:.*## / { sub("%", "NAME", $$1); sub("^report$$", "report LOG=FILE", $$1); \
+	awk -F ':.*## ' '/^[a-z%-]+:.*## / { sub("%", "NAME", $$1); sub("^(report|pdf)$$", "& LOG=FILE", $$1); \
 	  printf "  make %-17s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 	echo
 	echo "  ARGS='...' is handed on, for example: make report LOG=shift.mcap ARGS='--strict'"
 
 report: log-is-named .venv/runtime.stamp ## Turn one log into tracks and a report
 	$(BIN)/gradetrace report '$(LOG)' $(ARGS)
+
+# Where the page lies; `make pdf PAGE=runs/shift/report.html` prints one that is there already.
+PAGE     ?=
+CHROMIUM ?=
+# Off the network, like the page itself.
+PRINTING := --headless --no-sandbox --disable-gpu --disable-quic --disable-dev-shm-usage --no-first-run \
+  --disable-background-networking --disable-component-update --disable-sync --disable-default-apps \
+  '--host-resolver-rules=MAP * ~NOTFOUND' --virtual-time-budget=3000 --no-pdf-header-footer
+
+pdf: $(if $(PAGE),,report) ## Turn one log into a report, and the report into report.pdf beside it
+	page='$(PAGE)'; \
+	if [ -z "$$page" ]; then log='$(LOG)'; log="$${log##*/}"; page="runs/$${log%.*}/report.html"; fi; \
+	[ -f "$$page" ] || { \
+	  echo "no report: there is no $$page; make one with: make report LOG=FILE, or name one with PAGE=FILE" >&2; exit 2; }; \
+	browser='$(CHROMIUM)'; \
+	for name in chromium chromium-browser google-chrome google-chrome-stable; do \
+	  [ -n "$$browser" ] || browser="$$(command -v $$name || true)"; done; \
+	[ -x "$$browser" ] || { \
+	  echo "make pdf needs Chromium, and there is none; on Debian and Ubuntu: apt install chromium, or name one: CHROMIUM=FILE" >&2; exit 2; }; \
+	folder="$$(cd "$$(dirname "$$page")" && pwd -P)"; pdf="$$folder/$$(basename "$${page%.*}").pdf"; \
+	address="$$($(PYTHON) -c 'import pathlib, sys; print(pathlib.Path(sys.argv[1]).resolve().as_uri())' "$$page")"; \
+	scratch="$$(mktemp -d)"; trap 'rm -rf "$$scratch"' EXIT; \
+	"$$browser" $(PRINTING) --user-data-dir="$$scratch/profile" --print-to-pdf="$$scratch/page.pdf" "$$address" \
+	  2> "$$scratch/said" || true; \
+	[ -s "$$scratch/page.pdf" ] || { tail -n 5 "$$scratch/said" >&2; echo "$$browser printed nothing" >&2; exit 2; }; \
+	cp "$$scratch/page.pdf" "$$pdf.partial" && mv "$$pdf.partial" "$$pdf"; \
+	echo "pdf: $$pdf"
 
 log-is-named:
 	[ -n '$(LOG)' ] || { \

@@ -31,14 +31,14 @@ class Browser:
     """One short life of Chromium per call, each with a fresh profile."""
 
     def __init__(self, program, folder):
-        self._program, self._folder, self._count = program, folder, 0
+        self.program, self._folder, self._count = program, folder, 0
 
     def __call__(self, page, *flags):
         """What it prints when it opens `page`, a file, with these flags."""
         self._count += 1
         profile = self._folder / f"profile-{self._count}"
         done = subprocess.run(
-            [self._program, *FLAGS, f"--user-data-dir={profile}", *flags, Path(page).as_uri()],
+            [self.program, *FLAGS, f"--user-data-dir={profile}", *flags, Path(page).as_uri()],
             capture_output=True,
             timeout=120,
             check=True,
