@@ -122,7 +122,7 @@ def mesh_of_cells(cells: CutCells, alignment: Alignment, max_faces: int = MAX_FA
     while 2 * np.count_nonzero(squares) > max_faces:
         # Trenches are long and narrow: across they are thinned late, or their edges would suffer.
         step += 1 + step // 8
-        every, across = min(step, len(index) - 1), max(1, step // 8)
+        every, across = min(step, len(index) - 1), max(1, step // 10)
         squares = _whole_squares(total, every, across)
     faces = _faces(index, squares, every, across)
     if len(faces) > max_faces:  # by half squares, which stand at the end

@@ -241,6 +241,7 @@ def pages(tmp_path_factory):
 def test_a_page_as_it_is_written_can_be_compared(pages):
     inputs, (day, night) = pages
     found = compare_reports(read_report(day), read_report(night / "report.json"))
+    assert found.b.files["log"][0] == "\ufffd[2Jnight.mcap", "no name clears a terminal"
     stations = inputs.tables["stations"]
     np.testing.assert_allclose(found.station, stations["station"], atol=1e-5)
     np.testing.assert_allclose(found.deviation_a, 1000 * stations["deviation"], atol=6e-4)
