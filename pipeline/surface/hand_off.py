@@ -3,8 +3,8 @@
 * **Surface**: corners are the centres of cells that were cut and hang together, side by side, with the cut floor, at
   their own elevations; faces join only cells that lie side by side. A cell that was not cut leaves a hole, and no
   face reaches across it. Where that would make more than `MAX_FACES` faces only every k-th row of cells along the
-  alignment keeps its corners (of wide surfaces every so many columns too), and a face stands only where every cell
-  that it covers was cut: thinning can make a gap wider and never narrower.
+  alignment and the last one keep their corners (of wide surfaces every so many columns too), and a face stands only
+  where every cell that it covers was cut: thinning can make a gap wider and never narrower.
 * **Points**: three per station that was reached, on the floor as it was cut: its left edge, its middle, its right edge.
 * **Profile**: the mean floor of the stations that were reached, in stretches without a gap.
 
@@ -118,13 +118,13 @@ def mesh_of_cells(cells: CutCells, alignment: Alignment, max_faces: int = MAX_FA
     total = np.zeros((index.shape[0] + 1, index.shape[1] + 1), np.int32)
     total[1:, 1:] = np.cumsum(np.cumsum(index >= 0, axis=0, dtype=np.int32), axis=1)
     step, every, across = 1, 1, 1
-    squares = _whole_squares(total, every, across)
+    squares, kept = _whole_squares(total, every, across)
     while 2 * np.count_nonzero(squares) > max_faces:
         # Trenches are long and narrow: across they are thinned late, or their edges would suffer.
         step += 1 + step // 8
-        every, across = min(step, len(index) - 1), max(1, step // 10)
-        squares = _whole_squares(total, every, across)
-    faces = _faces(index, squares, every, across)
+        every, across = step, max(1, step // 10)
+        squares, kept = _whole_squares(total, every, across)
+    faces = _faces(index[kept], squares, halves=every == across == 1)
     if len(faces) > max_faces:  # by half squares, which stand at the end
         faces = faces[: 2 * np.count_nonzero(squares)]
     used, corner = np.unique(faces, return_inverse=True)
@@ -198,29 +198,28 @@ def stretches(station: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, ...]:
     )
 
 
-def _whole_squares(total: np.ndarray, along: int, across: int) -> np.ndarray:
-    """Bool image: whether every cell of the square from one kept row and column to the next was cut, both included."""
-    high = total[along + 1 :: along]
-    low = total[: len(total) - along - 1 : along]
-    left = slice(None, total.shape[1] - across - 1, across)
-    right = slice(across + 1, None, across)
-    count = high[:, right] - high[:, left] - low[:, right] + low[:, left]
-    whole = count == (along + 1) * (across + 1)
-    assert isinstance(whole, np.ndarray)
-    return whole
+def _whole_squares(total: np.ndarray, every: int, across: int) -> tuple[np.ndarray, tuple[np.ndarray, ...]]:
+    """Bool image of squares that were cut whole, and the rows and columns between which they lie.
+
+    A square reaches from one kept row and column to the next, these included; the last ones are always kept.
+    """
+    rows, columns = (
+        np.unique(np.append(np.arange(0, count, step), count - 1))
+        for count, step in zip((total.shape[0] - 1, total.shape[1] - 1), (every, across))
+    )
+    low, high = total[rows[:-1]], total[rows[1:] + 1]
+    left, right = columns[:-1], columns[1:] + 1
+    cut = high[:, right] - high[:, left] - low[:, right] + low[:, left]
+    return cut == np.outer(np.diff(rows) + 1, np.diff(columns) + 1), np.ix_(rows, columns)
 
 
-def _faces(index: np.ndarray, squares: np.ndarray, along: int, across: int) -> np.ndarray:
-    """(m, 3) numbers of cells: two triangles for each whole square; unthinned, one where three of four were cut."""
-    kept = index[::along, ::across]
-    rows, columns = squares.shape
-    near, far = kept[:rows], kept[1 : rows + 1]
-    corners = np.stack(
-        [near[:, :columns], near[:, 1 : columns + 1], far[:, 1 : columns + 1], far[:, :columns]], axis=-1
-    ).astype(np.int64)
+def _faces(index: np.ndarray, squares: np.ndarray, halves: bool) -> np.ndarray:
+    """(m, 3) numbers of cells: two triangles for each whole square; with `halves`, one where three of four were cut."""
+    near, far = index[:-1], index[1:]
+    corners = np.stack([near[:, :-1], near[:, 1:], far[:, 1:], far[:, :-1]], axis=-1).astype(np.int64)
     whole = corners[squares]
     pieces = [np.stack([whole[:, [0, 1, 3]], whole[:, [1, 2, 3]]], axis=1).reshape(-1, 3)]
-    if along == across == 1:
+    if halves:
         there = corners >= 0
         three = there.sum(axis=-1) == 3
         pieces += [np.delete(corners[three & ~there[..., gone]], gone, axis=1) for gone in range(4)]

@@ -114,14 +114,14 @@ def test_faces_turn_to_the_left_and_carry_the_cells_own_elevations():
     row = np.round((mesh.points[:, 1] - NORTH) / CELL - 0.5).astype(int)
     column = np.round((mesh.points[:, 0] - EAST) / CELL + 4.5).astype(int)
     np.testing.assert_array_equal(mesh.points[:, 2], h[row, column])
-    assert np.all(row % mesh.every == 0)
+    assert set(row) == {*range(0, 40, mesh.every), 39}
 
 
 def test_a_wide_field_is_thinned_both_ways_and_keeps_its_area():
     mesh = mesh_of_cells(cells_of(np.ones((2001, 801), bool)), north(200.0), 2_000)
     assert mesh.every > 8 and mesh.across > 1
     assert 1_200 < len(mesh.faces) <= 2_000
-    assert mesh.areas()[0] == pytest.approx(2000 * 800 * CELL**2, rel=0.05)
+    assert mesh.areas()[0] == pytest.approx(2000 * 800 * CELL**2, rel=1e-6)
 
 
 def test_cells_that_nothing_joins_to_the_floor_are_no_surface():
