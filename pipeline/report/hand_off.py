@@ -22,9 +22,12 @@ from pipeline.surface.hand_off import (
     mesh_of_cells,
     stretches,
 )
+from pipeline.surface.plan_geometry import without_spirals
 
 AS_BUILT_POINTS = "as_built_pnezd"
 LANDXML, DXF = "as_built.xml", "as_built.dxf"
+CHORD_ERROR_M = 0.0005
+"""Spirals are handed on as chords this close to them: few readers of either format follow spirals."""
 FILES = (
     "report.json",
     "stations.csv",
@@ -33,6 +36,8 @@ FILES = (
     LANDXML,
     DXF,
     "as_built.parquet",
+    "sides.parquet",
+    "volumes.parquet",
     "cutting_edge.parquet",
     "poses.parquet",
 )
@@ -52,7 +57,7 @@ def hand_off_of(inputs: ReportInputs, units: Units) -> HandOff | None:
         project=inputs.site.site.name or inputs.site.site.id,
         version=inputs.versions.get("gradetrace", ""),
         recorded_ns=span[1],
-        alignment=line,
+        alignment=without_spirals(line, CHORD_ERROR_M),
         surface=Mesh(np.zeros((0, 3)), np.zeros((0, 3), int))
         if cells is None
         else mesh_of_cells(cells, line),

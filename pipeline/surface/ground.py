@@ -79,5 +79,5 @@ def read_ground(path: Path | None, site: Site, alignment: Alignment) -> Ground |
     assert path is not None
     landxml = read_landxml(path)
     check_unit(landxml, site.grid.unit)
-    surface = landxml.surface(wanted.surface)
+    surface = landxml.surface(wanted.surface, "ground.surface")
     return Ground(tin_of(surface, landxml.source, alignment, site), sigma_m)

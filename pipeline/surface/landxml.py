@@ -79,9 +79,9 @@ class LandXml:
             raise SurfaceError(self.pipe_fault)
         return self.placed_pipes
 
-    def surface(self, name: str | None) -> TinSurface:
-        """The surface of that name, or the only one. Raises SurfaceError."""
-        return _pick(self.surfaces, name, self.source, "surface", "design.surface")
+    def surface(self, name: str | None, key: str = "design.surface") -> TinSurface:
+        """The surface of that name, or the only one; `key` of site.toml asks for it. Raises SurfaceError."""
+        return _pick(self.surfaces, name, self.source, "surface", key)
 
     def alignment(self, name: str | None) -> XmlAlignment:
         """The alignment of that name, or the only one. Raises SurfaceError."""
@@ -134,7 +134,8 @@ def read_landxml(path: Path) -> LandXml:
 
 def _pick(found: tuple[_Item, ...], name: str | None, source: str, noun: str, key: str) -> _Item:
     if not found:
-        raise SurfaceError(f"{source}: holds no {noun}; export one, or mend design.file in site.toml")
+        table = key.partition(".")[0]
+        raise SurfaceError(f"{source}: holds no {noun}; export one, or mend {table}.file in site.toml")
     names = [item.name for item in found]
     if name is None:
         if len(found) > 1:

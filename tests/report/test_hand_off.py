@@ -189,7 +189,7 @@ def test_the_page_lists_its_files_by_name_and_links_to_none(made, content):
     rows = content["hand_off"]["files"]["rows"]
     assert [row["name"] for row in rows] == [
         "report.json", "stations.csv", "checks.csv", "as_built_pnezd.csv", "as_built.xml", "as_built.dxf",
-        "as_built.parquet", "cutting_edge.parquet", "poses.parquet",
+        "as_built.parquet", "sides.parquet", "volumes.parquet", "cutting_edge.parquet", "poses.parquet",
     ]  # fmt: skip
     assert all(f"{row['name']}" in made[1].html and len(row["holds"]) > 20 for row in rows)
 
@@ -206,6 +206,8 @@ def test_without_check_shots_no_file_of_them_is_promised():
         "report.json",
         "stations.csv",
         "as_built.parquet",
+        "sides.parquet",
+        "volumes.parquet",
         "cutting_edge.parquet",
         "poses.parquet",
     ]

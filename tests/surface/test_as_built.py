@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.errors import SurfaceError
-from pipeline.surface.as_built import SurfaceRule, as_built
+from pipeline.surface.as_built import SurfaceRule, as_built, reach_of
 from pipeline.surface.design import ProfileDesign
 
 CUT, OVER, NEVER = 2, 1, 0
@@ -162,3 +162,23 @@ def test_the_same_edge_gives_the_same_surface_to_the_bit(trench):
     one, two = (as_built(edge, trench.alignment, trench.design, 0.05) for _ in range(2))
     for name in ("state", "h", "sigma_own", "lowest_time_ns"):
         assert np.array_equal(getattr(one, name), getattr(two, name), equal_nan=name in ("h", "sigma_own"))
+
+
+def test_the_chainage_reached_has_its_gaps(trench):
+    two = [trench.passes([50.0], 2.0, 4.0), trench.passes([50.0], 5.5, 8.0)]
+    later = two[1].time_ns + 60 * 10**9
+    edge = replace(
+        two[0],
+        time_ns=np.concatenate([two[0].time_ns, later]),
+        **{
+            name: np.concatenate([getattr(part, name) for part in two])
+            for name in ("p_grid", "seen", "cov", "common")
+        },
+    )
+    reach = reach_of(as_built(edge, trench.alignment, trench.design, 0.05))
+    assert reach.first == pytest.approx(2.0, abs=0.051) and reach.last == pytest.approx(8.0, abs=0.051)
+    assert reach.dug == pytest.approx(4.5, abs=0.11)
+    ((first, last),) = reach.gaps
+    assert first == pytest.approx(4.0, abs=0.051) and last == pytest.approx(5.5, abs=0.051)
+    nothing = reach_of(as_built(trench.passes([52.0]), trench.alignment, trench.design, 0.05))
+    assert np.isnan(nothing.first) and nothing.dug == 0 and nothing.gaps == ()
