@@ -16,7 +16,7 @@ def test_cells_volumes_and_sides_of_four_drawn_trenches_are_as_sure_as_they_say(
     print(
         f"cells {rms:.2f}, bias {bias:+.2f}, plain {plain:+.2f}; volumes {of_volumes.round(2)}; sides {of_sides:.2f}"
     )
-    # Four draws of the common error leave the mean uncertain by a third of a sigma; what the correction takes out is sure.
+    # Four draws of the common error leave the mean unsure by a third of a sigma; what the correction takes is sure.
     assert bias - plain > 2 * BIAS_BAR, "the correction would not be needed"
     assert abs(bias) < 0.7 and 0.6 < rms < 1.4
     assert np.all(of_volumes < 2.0) and of_sides < 1.4
