@@ -176,4 +176,6 @@ def solution_of(problem: Problem, optimum: Optimum, settings: EstimationSettings
         **checked,
         "warnings": warnings,
     }
-    return Solution(all_epochs.states, tuple(statics), table, figures, tuple(warnings))
+    return Solution(
+        all_epochs.states, tuple(statics), table, figures, tuple(warnings), all_epochs.sensitivities
+    )

@@ -25,6 +25,7 @@ from pipeline.estimation.marginals import (
 from pipeline.estimation.optimise import Optimum
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
+from pipeline.estimation.sensitivities import Gathered, Sensitivities
 from pipeline.estimation.solution import BodyStates
 from pipeline.network import frames as fr
 
@@ -39,6 +40,8 @@ class Published:
     budget: dict
     by_class: dict
     lasting: dict
+    sensitivities: Sensitivities | None
+    """Of the cutting edge; None without one."""
     corner_fits: list[Fit]
     """Per group of corners."""
     sensor_fits: list[Fit]
@@ -71,6 +74,7 @@ def published(problem: Problem, optimum: Optimum, max_gap_s: float) -> Published
         for fits, fit in zip(sensor_fits, diagnostics.fit_sensors(*at), strict=True):
             fits.append(fit)
     budget, by_class, lasting = ({}, {}, {}) if gathered is None else gathered.told()
+    sensitivities = None if gathered is None else gathered.sensitivities.told()
     edge_seen = np.zeros(len(problem.epochs.time_ns), dtype=bool)
     if edge is not None:
         edge_seen[edge.rows] = edge.seen[edge.rows]
@@ -80,6 +84,7 @@ def published(problem: Problem, optimum: Optimum, max_gap_s: float) -> Published
         budget,
         by_class,
         lasting,
+        sensitivities,
         [_joined(fits) for fits in corner_fits],
         [_joined(fits) for fits in sensor_fits],
         found,
@@ -157,6 +162,7 @@ class _Edge:
         self.classes = np.zeros(len(problem.epochs.time_ns), dtype=np.int64)
         self.variances: list[dict[str, np.ndarray]] = []
         self.lasting = Lasting(problem.epochs.time_s, body.rows)
+        self.sensitivities = Gathered(problem, problem.network.edge_m)
 
     def add(self, part: Part, found: Marginals, track: BodyTrack) -> None:
         seen = self.body.seen[part.with_far_end]
@@ -167,6 +173,7 @@ class _Edge:
         rows = np.arange(here.start, here.stop)
         self.variances.append(vertical_budget(track, found.P_zz, self.groups, rows))
         self.lasting.add(track, found, part.start, part.epochs)
+        self.sensitivities.add(track, found, part.start, rows)
 
     def told(self) -> tuple[dict, dict, dict]:
         back = self.variances[::-1]

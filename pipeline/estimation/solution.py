@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.estimation.sensitivities import Sensitivities
+
 
 @dataclass(frozen=True, eq=False)
 class BodyStates:
@@ -77,6 +79,8 @@ class Solution:
     diagnostics: dict
     """For solution.json: plain numbers, strings, lists and dicts."""
     warnings: tuple[str, ...]
+    sensitivities: Sensitivities | None = None
+    """How the cutting edge answers to values of the files; None where there is no edge."""
 
     def body(self, name: str) -> BodyStates:
         """States of a body, or of ``tool``."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from pipeline.errors import ArtefactError
+from pipeline.estimation.sensitivities import Sensitivities, Source
 from pipeline.estimation.solution import BodyStates, CornerResiduals, StaticResult
 from pipeline.geometry import gaussian, so3
 from pipeline.network.model import Network, Observations, Readings
@@ -16,6 +18,8 @@ ACCEPTED = "accepted"
 _AXES = ("x", "y", "z", "rx", "ry", "rz")
 _TRIANGLE = [f"{a}_{b}" for i, a in enumerate(_AXES) for b in _AXES[i:]]
 _CORNERS = range(4)
+_SOURCE = ("kind", "name", "component", "unit")
+_RESPONSE = ("e", "n", "h", "re", "rn", "rh")
 
 
 def columns_of_states(states: BodyStates) -> Columns:
@@ -62,6 +66,45 @@ def columns_of_residuals(network: Network, table: CornerResiduals) -> Columns:
         "normalised": table.normalised,
         "weight": table.weight,
     }
+
+
+def columns_of_sensitivities(found: Sensitivities) -> Columns:
+    """Columns of the ``sensitivities`` table: per kept epoch one row per source."""
+    n, count = len(found.time_ns), len(found.sources)
+    columns: Columns = {"time_ns": np.repeat(found.time_ns, count)}
+    for name in _SOURCE:
+        words = np.array([getattr(source, name) for source in found.sources], dtype=object)
+        columns["source" if name == "kind" else name] = np.tile(words, n)
+    for axis, name in enumerate(_RESPONSE):
+        columns[name] = np.ascontiguousarray(found.response[..., axis]).ravel()
+    return columns
+
+
+def sensitivities_from_columns(columns: Columns) -> Sensitivities | None:
+    """Sensitivities from their table, None where it has no rows.
+
+    Raises
+    ------
+    ArtefactError
+        When the rows are not those of the same sources at one epoch after the other.
+    """
+    time_ns = columns["time_ns"]
+    if len(time_ns) == 0:
+        return None
+    count = int(np.searchsorted(time_ns, time_ns[0], side="right"))
+    whole = len(time_ns) % count == 0
+    if whole:
+        epochs = time_ns.reshape(-1, count)
+        whole = bool(np.all(epochs == epochs[:, :1])) and bool(np.all(np.diff(epochs[:, 0]) > 0))
+    words = [columns["source" if name == "kind" else name] for name in _SOURCE]
+    if not whole or any(bool(np.any(w.reshape(-1, count) != w[:count])) for w in words):
+        raise ArtefactError(
+            "sensitivities.parquet does not hold the same sources at one epoch after the other; "
+            "delete it and run the estimate stage again"
+        )
+    response = np.stack([columns[name].reshape(-1, count) for name in _RESPONSE], axis=-1)
+    sources = tuple(Source(*(str(w[i]) for w in words)) for i in range(count))
+    return Sensitivities(np.ascontiguousarray(time_ns[::count]), sources, response)
 
 
 def observations_of(network: Network, detections: Mapping[str, Mapping[str, np.ndarray]]) -> Observations:

@@ -144,11 +144,11 @@ STAGES = (
     Stage("detect", 7, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        16,
+        17,
         "adjusting the network",
         ("ingest", "detect"),
         (),
-        ("states", "statics", "residuals"),
+        ("states", "statics", "residuals", "sensitivities"),
         _adjusting,
     ),
     Stage("track", 1, "poses and cutting edge", ("estimate",), (), ("poses", "cutting_edge"), _tracking),

@@ -1,4 +1,6 @@
-"""estimate: everything that was seen and read, adjusted at once; `states`, `statics`, `residuals`, solution.json."""
+"""estimate: everything that was seen and read, adjusted at once; `states`, `statics`, `residuals`,
+`sensitivities`, solution.json.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from pipeline.estimation import adjust
 from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.table import (
     columns_of_residuals,
+    columns_of_sensitivities,
     columns_of_states,
     columns_of_statics,
     observations_of,
@@ -23,6 +26,7 @@ from pipeline.logs.clock import EARLIEST_NS
 from pipeline.network import network_of
 from pipeline.runs import atomic_file
 from pipeline.stages.job import Counts, Job, Progress
+from pipeline.tables import empty_columns
 
 WORTH_S = 1.0
 """An iteration that took less than this is not kept."""
@@ -48,6 +52,11 @@ def run(job: Job, progress: Progress) -> Counts:
             writer.write(columns_of_states(states))
     job.write_table("statics", columns_of_statics(solution.statics))
     job.write_table("residuals", columns_of_residuals(network, solution.residuals))
+    answer = solution.sensitivities
+    job.write_table(
+        "sensitivities",
+        empty_columns("sensitivities") if answer is None else columns_of_sensitivities(answer),
+    )
     job.write_json("solution.json", solution.diagnostics)
     progress.advance(1)
     for sentence in solution.warnings:

@@ -1,46 +1,33 @@
-"""Total-station shots from a text file: point, two coordinates in a stated order, elevation, description.
+"""Total-station shots from a text file: point, two coordinates in a stated order, elevation, description, and more.
 
 PNEZD and PENZD cannot be told apart by their form, so the order is stated in site.toml and checked against where
-the design is. Ids are strings: `007` is not 7 and `NA` is a name.
+the design is; a file with headings may have its columns in any order. Ids are strings: `007` is not 7 and `NA` is a
+name.
 """
 
 from __future__ import annotations
 
-import csv
-import io
-import re
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.errors import SurfaceError
+from pipeline.surface import shot_cells
+from pipeline.surface.shot_cells import EDGE_POINTS, KINDS, ORDERS, Layout, Row
 
 MAX_SHOTS = 1_000_000
 NEAR_M = 100.0
 """A shot this far outside the design's box still belongs to the job: control points, for example."""
-_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
-_DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-_HEADINGS = {
-    "n",
-    "north",
-    "northing",
-    "e",
-    "east",
-    "easting",
-    "z",
-    "elev",
-    "elevation",
-    "height",
-    "y",
-    "x",
-    "h",
-}
+NO_TIME = int(np.iinfo(np.int64).min)
+"""Where a shot has no time: null of an integer column."""
+_NONE = np.zeros(0)
 
 
 @dataclass(frozen=True)
 class Shots:
-    """Total-station shots, in the order of the file."""
+    """Total-station shots, in the order of the file. What is left out is floor, without time or a sigma of its own."""
 
     point: np.ndarray
     """(n,) ids, strings."""
@@ -50,22 +37,53 @@ class Shots:
     """(n, 3) easting, northing, elevation; grid metres."""
     mended: tuple[int, ...] = ()
     """Lines of the file in which the separator after the point's name was missing and was put back."""
+    kind: np.ndarray = field(default_factory=lambda: _NONE)
+    """(n,) floor, edge or control."""
+    time_ns: np.ndarray = field(default_factory=lambda: _NONE)
+    """(n,) int64 UTC, or NO_TIME."""
+    edge_point: np.ndarray = field(default_factory=lambda: _NONE)
+    """(n,) left, middle or right; empty where the file does not say."""
+    sigma_m: np.ndarray = field(default_factory=lambda: _NONE)
+    """(n,) standard deviation that the file gives, nan where it gives none."""
+
+    def __post_init__(self) -> None:
+        n = len(self.point)
+        whole = {
+            "kind": np.full(n, "floor", object),
+            "time_ns": np.full(n, NO_TIME, np.int64),
+            "edge_point": np.full(n, "", object),
+            "sigma_m": np.full(n, np.nan),
+        }
+        for name, value in whole.items():
+            if getattr(self, name) is _NONE:
+                object.__setattr__(self, name, value)
+            assert len(getattr(self, name)) == n, name
 
     def __len__(self) -> int:
         return len(self.point)
 
 
-def read_shots(path: Path, order: str, metres_per_unit: float) -> Shots:
-    """Shots of a text file separated by commas, semicolons or tabs, with or without a line of headings.
+def read_shots(
+    path: Path,
+    order: str,
+    metres_per_unit: float,
+    zone: str = "",
+    kind_of_code: Mapping[str, str] | None = None,
+) -> Shots:
+    """Shots of a text file separated by commas, semicolons, tabs or blanks, with or without a line of headings.
 
     Parameters
     ----------
     path : Path
         UTF-8 (Latin-1 is understood); a decimal comma is understood where the separator is not a comma.
     order : str
-        `PNEZD` (northing first) or `PENZD` (easting first).
+        `PNEZD` (northing first), `PENZD` (easting first), or `named`: as the headings say.
     metres_per_unit : float
         Of the grid.
+    zone : str
+        IANA name of the clock of times without an offset from UTC.
+    kind_of_code : mapping, optional
+        First word of a description -> kind of shot, for files without a column of kinds.
 
     Returns
     -------
@@ -77,53 +95,18 @@ def read_shots(path: Path, order: str, metres_per_unit: float) -> Shots:
     SurfaceError
         Names file and line.
     """
-    assert order in ("PNEZD", "PENZD"), order
+    assert order == "named" or order in ORDERS, order
     text = _text(path)
-    lines = [line for line in text.splitlines() if line.strip()]
-    if not lines:
+    if not text.strip():
         return Shots(np.zeros(0, object), np.zeros(0, object), np.zeros((0, 3)))
-    # The separator is what most lines have at least three of; tabs and semicolons never stand inside a number.
-    separator = next(
-        (s for s in "\t;," if sum(line.count(s) >= 3 for line in lines) > len(lines) / 2),
-        None,
-    )
-    if separator is None:
-        raise SurfaceError(
-            f"{path.name}: no lines of point, two coordinates, elevation and description separated by commas, "
-            f"semicolons or tabs; the first one is '{lines[0][:60]}'"
-        )
-    rows = csv.reader(io.StringIO(text), delimiter=separator)
-    point, code, coordinates = [], [], []
-    mended: list[int] = []
-    heading = True
-    try:
-        for row in rows:
-            cells = [cell.strip() for cell in row]
-            if not any(cells):
-                continue
-            if heading and any(cell.lower() in _HEADINGS for cell in cells[1:4]):
-                heading = False
-                _check_heading(cells, order, path.name)
-                continue
-            heading = False
-            where = f"{path.name}:{rows.line_num}"
-            if whole := _with_separator(cells):
-                cells = whole
-                mended.append(rows.line_num)
-            if len(cells) < 4:
-                raise SurfaceError(
-                    f"{where}: expected point, two coordinates and elevation, found {len(cells)} columns"
-                )
-            first, second, elevation = (_number(cell, separator, where) for cell in cells[1:4])
-            point.append(cells[0])
-            code.append(separator.join(cells[4:]).strip(separator + " "))
-            coordinates.append((second, first, elevation) if order == "PNEZD" else (first, second, elevation))
-            if len(point) > MAX_SHOTS:
-                raise SurfaceError(f"{path.name}: more than {MAX_SHOTS} shots; cut the file down to the job")
-    except csv.Error as error:
-        raise SurfaceError(f"{path.name}:{rows.line_num}: not readable as CSV ({error})") from None
-    p_grid = np.array(coordinates, dtype=np.float64).reshape(-1, 3) * metres_per_unit
-    return Shots(np.array(point, dtype=object), np.array(code, dtype=object), p_grid, tuple(mended))
+    separator, headings, rows = shot_cells.rows_of(text, path.name)
+    layout = shot_cells.layout_of(headings, order, path.name)
+    reader = _Reader(layout, separator, zone, kind_of_code or {})
+    for row in rows:
+        reader.add(row)
+        if len(reader.point) > MAX_SHOTS:
+            raise SurfaceError(f"{path.name}: more than {MAX_SHOTS} shots; cut the file down to the job")
+    return reader.shots(metres_per_unit)
 
 
 def check_order(shots: Shots, low_en: np.ndarray, high_en: np.ndarray, order: str, source: str) -> None:
@@ -148,10 +131,80 @@ def check_order(shots: Shots, low_en: np.ndarray, high_en: np.ndarray, order: st
         for q in (en, en[:, ::-1])
     )
     if as_stated < 0.5 * len(shots) and exchanged > max(0.5 * len(shots), as_stated):
-        other = "PENZD" if order == "PNEZD" else "PNEZD"
+        remedy = (
+            "The headings northing and easting are exchanged"
+            if order == "named"
+            else f"Write checks.order = '{'PENZD' if order == 'PNEZD' else 'PNEZD'}' in site.toml"
+        )
         raise SurfaceError(
             f"{source}: read as {order}, {as_stated} of {len(shots)} shots lie near the design; with northing and "
-            f"easting exchanged {exchanged} do. Write checks.order = '{other}' in site.toml"
+            f"easting exchanged {exchanged} do. {remedy}"
+        )
+
+
+class _Reader:
+    """The columns of the shots, row by row."""
+
+    def __init__(self, layout: Layout, separator: str, zone: str, kind_of_code: Mapping[str, str]):
+        self.layout, self.separator, self.zone, self.kind_of_code = layout, separator, zone, kind_of_code
+        self.point: list[str] = []
+        self.code: list[str] = []
+        self.enh: list[tuple[float, float, float]] = []
+        self.kind: list[str] = []
+        self.time_ns: list[int] = []
+        self.edge_point: list[str] = []
+        self.sigma_m: list[float] = []
+        self.mended: list[int] = []
+        self.least = 1 + max(layout.columns[name] for name in ("point", "northing", "easting", "elevation"))
+
+    def add(self, row: Row) -> None:
+        cells = row.cells
+        if whole := shot_cells.with_separator(cells):
+            cells = whole
+            self.mended.append(row.line)
+        if len(cells) < self.least:
+            raise SurfaceError(
+                f"{row.where}: expected point, two coordinates and elevation, found {len(cells)} columns"
+            )
+        columns = self.layout.columns
+        easting, northing, elevation = (
+            shot_cells.number(cells[columns[name]], self.separator, row.where)
+            for name in ("easting", "northing", "elevation")
+        )
+        code = self._cell(cells, "code")
+        if self.layout.code_to_end and "code" in columns:
+            code = self.separator.join(cells[columns["code"] :]).strip(self.separator + " ")
+        time, kind = self._cell(cells, "time"), self._cell(cells, "kind").lower()
+        sigma, edge_point = self._cell(cells, "sigma_mm"), self._cell(cells, "edge_point").lower()
+        if kind and kind not in KINDS:
+            raise SurfaceError(f"{row.where}: kind '{kind[:40]}' is none of {', '.join(KINDS)}")
+        if edge_point and edge_point not in EDGE_POINTS:
+            raise SurfaceError(f"{row.where}: edge_point '{edge_point[:40]}' is none of {', '.join(EDGE_POINTS)}")
+        sigma_m = shot_cells.number(sigma, self.separator, row.where) / 1000 if sigma else np.nan
+        if sigma_m <= 0:
+            raise SurfaceError(f"{row.where}: sigma_mm {sigma} is not above zero; leave the cell empty if unknown")
+        words = code.lower().split()
+        self.point.append(cells[columns["point"]])
+        self.code.append(code)
+        self.enh.append((easting, northing, elevation))
+        self.kind.append(kind or self.kind_of_code.get(code.split()[0] if words else "", "floor"))
+        self.time_ns.append(shot_cells.time_ns(time, self.zone, row.where) if time else NO_TIME)
+        told = [name for name in EDGE_POINTS if name in words]
+        self.edge_point.append(edge_point or (told[0] if len(told) == 1 else ""))
+        self.sigma_m.append(sigma_m)
+
+    def _cell(self, cells: list[str], name: str) -> str:
+        place = self.layout.columns.get(name)
+        return "" if place is None or place >= len(cells) else cells[place]
+
+    def shots(self, metres_per_unit: float) -> Shots:
+        words = {name: np.array(getattr(self, name), object) for name in ("point", "code", "kind", "edge_point")}
+        return Shots(
+            p_grid=np.array(self.enh, dtype=np.float64).reshape(-1, 3) * metres_per_unit,
+            mended=tuple(self.mended),
+            time_ns=np.array(self.time_ns, np.int64),
+            sigma_m=np.array(self.sigma_m, np.float64),
+            **words,
         )
 
 
@@ -170,34 +223,3 @@ def _text(path: Path) -> str:
         return data.decode("latin-1")
 
 
-def _check_heading(cells: list[str], order: str, source: str) -> None:
-    """Headings that say the opposite of site.toml are an error; others are passed over."""
-    first, second = cells[1].lower(), cells[2].lower()
-    if (order == "PNEZD" and first.startswith("e") and second.startswith("n")) or (
-        order == "PENZD" and first.startswith("n") and second.startswith("e")
-    ):
-        other = "PENZD" if order == "PNEZD" else "PNEZD"
-        raise SurfaceError(
-            f"{source}: its headings are {', '.join(cells[:4])}, but site.toml says checks.order = '{order}'; "
-            f"write '{other}'"
-        )
-
-
-def _with_separator(cells: list[str]) -> list[str] | None:
-    """The cells of a line like ``FS968 B 989.18 | 996.05 | 99.93 |`` with its name and first number parted, or None.
-
-    Total stations write such lines where a name fills its field. Only one reading of them makes three numbers.
-    """
-    name, _, number = cells[0].rpartition(" ")
-    numbers = [bool(_NUMBER.fullmatch(cell)) for cell in cells[1:4]]
-    if name and _NUMBER.fullmatch(number) and numbers[:2] == [True, True] and numbers[2:] != [True]:
-        return [name.strip(), number, *cells[1:]]
-    return None
-
-
-def _number(cell: str, separator: str, where: str) -> float:
-    if separator != "," and _DECIMAL_COMMA.fullmatch(cell):
-        cell = cell.replace(",", ".")
-    if not _NUMBER.fullmatch(cell):
-        raise SurfaceError(f"{where}: expected a number, found '{cell[:40]}'")
-    return float(cell)
