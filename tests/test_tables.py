@@ -30,7 +30,7 @@ def random_columns(name, rows, seed=0):
             if column.nullable:
                 values[::4] = tables.NULL_INT
         else:
-            values = rng.normal(size=rows)
+            values = rng.normal(size=rows).astype(column.type)
             if column.nullable:
                 values[::3] = np.nan
         columns[column.name] = values

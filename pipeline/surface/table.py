@@ -77,11 +77,18 @@ def columns_of_volumes(volumes: Volumes) -> Columns:
 
 def columns_of_checks(shots: Shots, comparison: Comparison) -> Columns:
     """Columns of the ``checks`` table."""
+    whole = ("station", "offset", "as_built_h", "difference", "difference_e", "difference_n", "sigma_own")
+    plan = {axis: comparison.own[:, i, i] + comparison.common[:, i, i] for i, axis in enumerate("en")}
+    edge = shots.kind != "floor"
     return {
         "point": shots.point,
         "code": shots.code,
+        "kind": shots.kind,
+        "edge_point": comparison.edge_point,
+        "time_ns": comparison.time_ns,
         "e": shots.p_grid[:, 0],
         "n": shots.p_grid[:, 1],
         "h": shots.p_grid[:, 2],
-        **{name: getattr(comparison, name) for name in Comparison.__dataclass_fields__},
+        **{name: getattr(comparison, name) for name in (*whole, "sigma_common", "sigma", "sigma_ts", "z", "result")},
+        **{f"sigma_{axis}": np.where(edge, np.sqrt(variance), np.nan) for axis, variance in plan.items()},
     }
