@@ -199,7 +199,7 @@ def test_truncated_file_is_told(tmp_path, keep):
 def test_other_table_and_other_version_are_told(tmp_path, monkeypatch):
     path = tmp_path / "t.parquet"
     tables.write_table(path, "sensors", random_columns("sensors", 5))
-    with pytest.raises(ArtefactError, match="holds sensors table, version 1; expected checks, version 1"):
+    with pytest.raises(ArtefactError, match="holds sensors table, version 1; expected checks, version 2"):
         tables.read_table(path, "checks")
     schema = tables.read_schema("sensors")
     newer = tables.TableSchema(schema.name, 2, schema.meaning, schema.columns)
