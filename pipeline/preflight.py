@@ -135,7 +135,8 @@ def _file_findings(site: Site, source: Source) -> Iterator[Finding]:
     from pipeline.surface.shots import read_shots
 
     try:
-        shots = read_shots(files["checks"].path, site.checks.order, site.grid.metres_per_unit)
+        scale, zone = site.grid.metres_per_unit, site.report.time_zone
+        shots = read_shots(files["checks"].path, site.checks.order, scale, zone, site.checks.codes)
     except PipelineError as error:
         yield Finding("error", str(error))
         return

@@ -148,6 +148,8 @@ def _sources(problem: Problem) -> tuple[tuple[Source, ...], np.ndarray]:
         if not marker.benchmark or not static.surveyed:
             continue
         for axis, name in enumerate("enh"):
-            change = np.concatenate([static.value[axis, :3], np.zeros(3)])  # a shift in the world, felt in the marker
+            change = np.concatenate(
+                [static.value[axis, :3], np.zeros(3)]
+            )  # a shift in the world, felt in the marker
             add(Source(BENCHMARK, marker.name, name, "m"), marker.mount, change)
     return tuple(sources), np.stack(moves, axis=1) if moves else np.zeros((statics.size, 0))

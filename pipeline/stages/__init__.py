@@ -104,6 +104,7 @@ def _surveying(job: Job) -> Settings:
     wanted = {"grid", "alignment", "design", "ground", "tolerance", "checks", "survey"}
     return {
         "width_m": job.machine.cutting_edge.width_m,
+        "time_zone": job.site.report.time_zone,
         **job.site.model_dump(mode="json", include=wanted),
     }
 
@@ -154,7 +155,7 @@ STAGES = (
     Stage("track", 1, "poses and cutting edge", ("estimate",), (), ("poses", "cutting_edge"), _tracking),
     Stage(
         "survey",
-        2,
+        3,
         "as-built against design",
         ("estimate", "track"),
         ("design", "ground", "checks"),
@@ -163,7 +164,7 @@ STAGES = (
     ),
     Stage(
         "report",
-        3,
+        4,
         "writing the report",
         ("ingest", "detect", "estimate", "track", "survey"),
         ("log", "design", "checks"),

@@ -37,15 +37,31 @@
             "worst",
             "worst_point",
             "reduced_chi_square",
+            "horizontal_rmse",
             "indicative_only",
             "shots",
             "outside_the_cut",
             "outside_the_alignment",
+            "used_in_calibration",
+            "results": {result: shots},
+            "kinds": {"floor": {the statistics above, "shots", "global_test"}, "edge": ..., "control": ...},
+            "diagnosis": {
+                "state": "none", "named", "cannot tell" or "unexplained",
+                "named": candidate or null,
+                "rivals": [candidate],
+                "telling_shot": fields of `surface.telling_shot.TellingShot` or null,
+                "global_test": {"statistic", "components", "p_value"},
+                "critical",
+                "common_factors": whether the adjustment gave the common errors,
+                "candidates": [fields of `surface.shot_errors.Cause` and `surface.diagnosis.Candidate`],
+            }
+            or null,
         }
         or null,
     }
 
-All lengths are metres; what there is nothing of is null.
+The statistics that stand in `checks` itself are those of the floor. All lengths are metres; what there is nothing of
+is null.
 """
 
 from __future__ import annotations
@@ -56,10 +72,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.site import Tolerance
+from pipeline.stages import check_shots
 from pipeline.stages.job import Counts, Job, Progress
 from pipeline.surface import table
 from pipeline.surface.as_built import AsBuilt, Reach, SurfaceRule, as_built, reach_of
-from pipeline.surface.checks import OUTSIDE_ALIGNMENT, OUTSIDE_CUT, Comparison, compare, summarise
 from pipeline.surface.decision import (
     CANNOT_TELL,
     FAIL,
@@ -74,9 +90,8 @@ from pipeline.surface.decision import (
     stations_along,
     with_sides,
 )
-from pipeline.surface.design import Design, TinDesign, floor_sentence, read_design
+from pipeline.surface.design import TinDesign, floor_sentence, read_design
 from pipeline.surface.ground import read_ground
-from pipeline.surface.shots import Shots, check_order, read_shots
 from pipeline.surface.sides import sides
 from pipeline.surface.sweep import path_along
 from pipeline.surface.volumes import Volume, volumes
@@ -100,7 +115,7 @@ def run(job: Job, progress: Progress) -> Counts:
     design, alignment = read_design(job.files["design"].path, site)
     ground_file = job.files.get("ground")
     ground = read_ground(ground_file.path if ground_file else None, site, alignment)
-    shots = _shots(job, design, alignment)
+    shots = check_shots.shots_of(job, design, alignment)
     progress.advance()
 
     edge = cutting_edge_from_columns(job.read_table("cutting_edge", EDGE_COLUMNS))
@@ -137,10 +152,8 @@ def run(job: Job, progress: Progress) -> Counts:
             f"{job.files['checks'].name}: in {len(shots.mended)} lines (the first is line {shots.mended[0]}) the "
             "separator after the point's name is missing; they were read as if it were there"
         )
-    if shots is not None and len(shots):
-        assert site.checks is not None
-        comparison = compare(shots, built, alignment, site.checks.sigma_mm / 1000)
-        checks = _check_facts(shots, comparison)
+    if shots is not None and site.checks is not None and (len(shots) or site.checks.control):
+        shots, comparison, checks = check_shots.compared(job, shots, edge, built, alignment)
         job.write_table("checks", table.columns_of_checks(shots, comparison))
         if not checks["n"]:
             progress.warn(
@@ -216,7 +229,7 @@ def run(job: Job, progress: Progress) -> Counts:
     }
     if checks is not None:
         counted["check shots"] = checks["shots"]
-        counted["of these compared"] = checks["n"]
+        counted["of these compared"] = sum(kind["n"] for kind in checks["kinds"].values())
     return counted
 
 
@@ -225,33 +238,6 @@ def _side_band(tolerance: Tolerance) -> ToleranceBand | None:
     if tolerance.wide_mm is None or tolerance.narrow_mm is None:
         return None
     return ToleranceBand(tolerance.wide_mm / 1000, tolerance.narrow_mm / 1000, tolerance.coverage_factor)
-
-
-def _shots(job: Job, design: Design, alignment) -> Shots | None:
-    """The check shots, if the site has any; their order is checked against where the trench is."""
-    if job.site.checks is None:
-        return None
-    shots = read_shots(job.files["checks"].path, job.site.checks.order, job.site.grid.metres_per_unit)
-    first, last = design.station_range()
-    stretch = alignment.points(np.linspace(first, last, 200), 0.0)
-    check_order(
-        shots,
-        stretch.min(axis=0),
-        stretch.max(axis=0),
-        job.site.checks.order,
-        job.files["checks"].name,
-    )
-    return shots
-
-
-def _check_facts(shots: Shots, comparison: Comparison) -> dict[str, Any]:
-    summary = asdict(summarise(shots, comparison))
-    return {
-        **{name.removesuffix("_m"): value for name, value in summary.items()},
-        "shots": len(shots),
-        "outside_the_cut": int(np.count_nonzero(comparison.result == OUTSIDE_CUT)),
-        "outside_the_alignment": int(np.count_nonzero(comparison.result == OUTSIDE_ALIGNMENT)),
-    }
 
 
 def _deviation_facts(stations: Stations) -> dict[str, float | None]:

@@ -90,7 +90,9 @@ def visits(edge: CuttingEdge, rests: Rests, p_grid: np.ndarray, radius_m: float)
     middle = (rests.first + rests.stop) // 2
     points = edge.p_grid[middle]
     left, along = points[:, 0], points[:, 2] - points[:, 0]
-    share = np.einsum("kj,kj->k", p_grid - left, along) / np.maximum(np.einsum("kj,kj->k", along, along), 1e-12)
+    share = np.einsum("kj,kj->k", p_grid - left, along) / np.maximum(
+        np.einsum("kj,kj->k", along, along), 1e-12
+    )
     away = np.linalg.norm(left + np.clip(share, 0.0, 1.0)[:, None] * along - p_grid, axis=1)
     near = np.flatnonzero(away <= radius_m)
     if not len(near):

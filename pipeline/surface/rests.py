@@ -78,7 +78,7 @@ def rests_of(edge: CuttingEdge, rule: RestRule | None = None) -> Rests:
         later = np.minimum(later, n - 1)
         maybe &= inside & (_away(edge.p_grid, edge.p_grid[later]) <= np.maximum(bound, bound[later]))
     k = 0
-    for i in np.flatnonzero(maybe):
+    for i in np.flatnonzero(maybe).tolist():
         if i < k:
             continue
         j = int(np.searchsorted(edge.time_ns, edge.time_ns[i] + still_ns, side="left"))
@@ -88,18 +88,23 @@ def rests_of(edge: CuttingEdge, rule: RestRule | None = None) -> Rests:
             limit = np.maximum(bound[here], bound[i])
             gone = np.flatnonzero(_away(edge.p_grid[here], edge.p_grid[i]) > limit)
             if len(gone):
-                end += int(gone[0])
+                end = end + int(gone[0])
                 break
             end = here.stop - 1
         if end >= j:
-            first.append(int(i))
+            first.append(i)
             stop.append(end + 1)
             k = end + 1
     return Rests(np.array(first, np.int64), np.array(stop, np.int64))
 
 
 def stand_at(
-    edge: CuttingEdge, rests: Rests, which: int, time_ns: int, correlation_s: float | None, rule: RestRule | None = None
+    edge: CuttingEdge,
+    rests: Rests,
+    which: int,
+    time_ns: int,
+    correlation_s: float | None,
+    rule: RestRule | None = None,
 ) -> Stand:
     """The mean of the edge about a time of a rest, with its covariances.
 

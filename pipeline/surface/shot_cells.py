@@ -83,7 +83,9 @@ def rows_of(text: str, source: str) -> tuple[str, list[str] | None, Iterator[Row
         )
     # Where a line ends in a description that is all; with other columns behind it each cell must be one word.
     titles = lines[0].split() if separator == " " and _titles(lines[0]) else []
-    words = len(titles) if len(titles) > 5 or (titles[4:] and HEADINGS.get(titles[4].lower()) != "code") else 0
+    words = (
+        len(titles) if len(titles) > 5 or (titles[4:] and HEADINGS.get(titles[4].lower()) != "code") else 0
+    )
     rows = _aligned(text, source, words) if separator == " " else _separated(text, separator, source)
     first = next(rows, None)
     if first is None:
@@ -134,7 +136,9 @@ def layout_of(headings: list[str] | None, order: str, source: str) -> Layout:
         return Layout(places, True)
     code = {"code": more["code"]} if "code" in more else {}
     more.pop("code", None)
-    return Layout({m: places[m] for m in stated[:4]} | more | code, bool(code) and code["code"] == len(headings) - 1)
+    return Layout(
+        {m: places[m] for m in stated[:4]} | more | code, bool(code) and code["code"] == len(headings) - 1
+    )
 
 
 def number(cell: str, separator: str, where: str) -> float:

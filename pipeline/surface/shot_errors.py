@@ -126,7 +126,9 @@ def differences_of(
     left_out = np.maximum(whole - np.einsum("mr,mr->m", common, common), 0.0)
     covariance[np.diag_indices(len(at))] += left_out + comparison.sigma_ts[at] ** 2
     causes = causes_of(answer, in_plan=not np.all(floor))
-    return Differences(at, u, value, covariance, common, causes, signature_of(causes, answer, moved, u, heading))
+    return Differences(
+        at, u, value, covariance, common, causes, signature_of(causes, answer, moved, u, heading)
+    )
 
 
 def causes_of(answer: Sensitivities | None, in_plan: bool) -> tuple[Cause, ...]:
@@ -163,7 +165,9 @@ def signature_of(
     return np.column_stack(columns)
 
 
-def response_at(answer: Sensitivities, edge: CuttingEdge, time_ns: np.ndarray, p_grid: np.ndarray) -> np.ndarray:
+def response_at(
+    answer: Sensitivities, edge: CuttingEdge, time_ns: np.ndarray, p_grid: np.ndarray
+) -> np.ndarray:
     """(m, sources, 3) shift along easting, northing, elevation of points of the edge, per unit of each source.
 
     Parameters

@@ -179,10 +179,14 @@ class _Reader:
         if kind and kind not in KINDS:
             raise SurfaceError(f"{row.where}: kind '{kind[:40]}' is none of {', '.join(KINDS)}")
         if edge_point and edge_point not in EDGE_POINTS:
-            raise SurfaceError(f"{row.where}: edge_point '{edge_point[:40]}' is none of {', '.join(EDGE_POINTS)}")
+            raise SurfaceError(
+                f"{row.where}: edge_point '{edge_point[:40]}' is none of {', '.join(EDGE_POINTS)}"
+            )
         sigma_m = shot_cells.number(sigma, self.separator, row.where) / 1000 if sigma else np.nan
         if sigma_m <= 0:
-            raise SurfaceError(f"{row.where}: sigma_mm {sigma} is not above zero; leave the cell empty if unknown")
+            raise SurfaceError(
+                f"{row.where}: sigma_mm {sigma} is not above zero; leave the cell empty if unknown"
+            )
         words = code.lower().split()
         self.point.append(cells[columns["point"]])
         self.code.append(code)
@@ -198,7 +202,9 @@ class _Reader:
         return "" if place is None or place >= len(cells) else cells[place]
 
     def shots(self, metres_per_unit: float) -> Shots:
-        words = {name: np.array(getattr(self, name), object) for name in ("point", "code", "kind", "edge_point")}
+        words = {
+            name: np.array(getattr(self, name), object) for name in ("point", "code", "kind", "edge_point")
+        }
         return Shots(
             p_grid=np.array(self.enh, dtype=np.float64).reshape(-1, 3) * metres_per_unit,
             mended=tuple(self.mended),
@@ -221,5 +227,3 @@ def _text(path: Path) -> str:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError:
         return data.decode("latin-1")
-
-

@@ -89,6 +89,9 @@ def columns_of_checks(shots: Shots, comparison: Comparison) -> Columns:
         "e": shots.p_grid[:, 0],
         "n": shots.p_grid[:, 1],
         "h": shots.p_grid[:, 2],
-        **{name: getattr(comparison, name) for name in (*whole, "sigma_common", "sigma", "sigma_ts", "z", "result")},
+        **{
+            name: getattr(comparison, name)
+            for name in (*whole, "sigma_common", "sigma", "sigma_ts", "z", "result")
+        },
         **{f"sigma_{axis}": np.where(edge, np.sqrt(variance), np.nan) for axis, variance in plan.items()},
     }

@@ -62,7 +62,16 @@ def telling_shot(
         expected = signature_of(causes, answer, moved, up, up)[:, wanted] * value
         k, apart = _widest(expected, np.hypot(own, sigma_ts_m))
         tried.append(
-            TellingShot("floor", float(station[k]), float(offset[k]), int(when[k]), "h", *map(float, expected[k]), apart)
+            TellingShot(
+                "floor",
+                float(station[k]),
+                float(offset[k]),
+                int(when[k]),
+                "h",
+                float(expected[k, 0]),
+                float(expected[k, 1]),
+                apart,
+            )
         )
     rows = np.flatnonzero(edge.seen)
     rows = rows[(edge.time_ns[rows] >= answer.time_ns[0]) & (edge.time_ns[rows] <= answer.time_ns[-1])]
@@ -74,12 +83,21 @@ def telling_shot(
         for i, name in enumerate("enh"):
             u = np.tile(np.eye(3)[i], (len(rows), 1))
             expected = signature_of(causes, answer, moved, u, u)[:, wanted] * value
-            own = np.sqrt(np.maximum(edge.cov[rows, 1, (0, 3, 5)[i]] - edge.common[rows, 1, (0, 3, 5)[i]], 0.0))
+            own = np.sqrt(
+                np.maximum(edge.cov[rows, 1, (0, 3, 5)[i]] - edge.common[rows, 1, (0, 3, 5)[i]], 0.0)
+            )
             k, apart = _widest(expected, np.hypot(own, sigma_ts_m))
             when_ns = int(edge.time_ns[rows[k]])
             tried.append(
                 TellingShot(
-                    "edge", float(station[k]), float(offset[k]), when_ns, name, *map(float, expected[k]), apart
+                    "edge",
+                    float(station[k]),
+                    float(offset[k]),
+                    when_ns,
+                    name,
+                    float(expected[k, 0]),
+                    float(expected[k, 1]),
+                    apart,
                 )
             )
     tried = [shot for shot in tried if shot.apart_sigmas >= ENOUGH_SIGMAS]

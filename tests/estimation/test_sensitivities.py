@@ -1,7 +1,6 @@
 """How the edge answers to a wrong value in a file: against adjustments of the same log with that value changed."""
 
 import copy
-import dataclasses
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from pipeline.estimation.optimise import optimise
 from pipeline.estimation.parts import bounds
 from pipeline.estimation.published import published
 from pipeline.estimation.table import columns_of_sensitivities, sensitivities_from_columns
-from pipeline.geometry import se3, so3
+from pipeline.geometry import so3
 from tests.estimation.simulator import MACHINE, SITE, Options, draw
 from tests.estimation.test_adjust import NO_LOSS, _problem
 
@@ -126,7 +125,9 @@ def test_a_log_in_parts_has_the_responses_of_the_log_in_one_piece(monkeypatch):
     assert np.all(np.diff(whole.time_ns) > 0.14e9) and len(whole.time_ns) < 0.5 * len(problem.epochs.time_ns)
     causes = [s.kind != "common" for s in whole.sources]
     shown = [s.kind != "common" for s in parts.sources]
-    assert [s for s in whole.sources if s.kind != "common"] == [s for s in parts.sources if s.kind != "common"]
+    assert [s for s in whole.sources if s.kind != "common"] == [
+        s for s in parts.sources if s.kind != "common"
+    ]
     np.testing.assert_allclose(parts.response[:, shown], whole.response[:, causes], rtol=1e-4, atol=1e-6)
     for told, of in ((parts, shown), (whole, causes)):
         factors = told.response[:, ~np.array(of), :3].astype(float)
