@@ -6,8 +6,8 @@ log itself says of the value is in ``S``, and a benchmark that two others hold a
 (sigma 0) has no unknown and no such response. Worn teeth shorten the edge along its own z whatever the log says.
 
 The common error of two instants k and l has the covariance ``M_k S^-1 M_l'``. ``M S^-1/2`` has a column per unknown, a
-hundred and more; nearly all of it is in the plane of a dozen of their combinations. These are found while the log goes by:
-what a part of the log does not share with the plane so far, if it is more than a thousandth, widens the plane.
+hundred and more; nearly all of it is in the plane of a dozen of their combinations. These are found while the log goes
+by: what a part of the log does not share with the plane so far, if it is more than a thousandth, widens the plane.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEP_S = 0.2
 """One epoch in so many seconds is kept. The edge turns by a few degrees in that time, and what lies between follows
 by a straight line to a few in a thousand."""
 LEFT_OUT = 1e-3
-"""Share of the common variance of a part of the log that may stay outside the plane; the reader adds it to the own part."""
+"""Share of the common variance of a part of the log that may stay outside the plane; the reader counts it as own."""
 MOST_FACTORS = 40
 WEAR, SENSOR, CLOCK, BENCHMARK, COMMON = "wear", "sensor", "time offset", "benchmark", "common"
 
@@ -50,8 +50,8 @@ class Sensitivities:
     """(n,) int64, ascending."""
     sources: tuple[Source, ...]
     response: np.ndarray
-    """(n, len(sources), 6) float32: shift of the edge's middle along e n h, and turn about these axes; metres and radians
-    per unit of the source. Of a factor: per standard deviation; they are independent."""
+    """(n, len(sources), 6) float32: shift of the edge's middle along e n h, and turn about these axes; metres and
+    radians per unit of the source. Of a factor: per standard deviation; they are independent."""
 
 
 class Gathered:
@@ -67,7 +67,7 @@ class Gathered:
         self.factors: list[np.ndarray] = []
 
     def add(self, track: BodyTrack, found: Marginals, start: int, rows: np.ndarray) -> None:
-        """A part's track of the tool and its marginals; ``rows`` of the part are published, ``start`` is its first epoch."""
+        """A part's track of the tool and its marginals; ``rows`` of it are published, ``start`` is its first epoch."""
         time_s = self.problem.epochs.time_s
         bins = np.floor(time_s / STEP_S).astype(np.int64)
         rows = rows[(start + rows == 0) | (bins[start + rows] != bins[np.maximum(start + rows - 1, 0)])]

@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 
 from pipeline.report import detector
+from pipeline.report.causes import cause_text, value_text
 from pipeline.report.evidence import MOVED_SIGMAS, Timeline
 from pipeline.report.facts import deviation_text, station_text
 from pipeline.report.inputs import ReportInputs
+from pipeline.report.measured import counted
 from pipeline.report.numbers import Number, duration_text
 from pipeline.report.units import Units, text_of
 from pipeline.report.words import Words
@@ -53,6 +55,7 @@ def attention(
     remarks = [
         *_of_log(inputs, words),
         *_of_stations(inputs, units, words),
+        *_of_causes(inputs, units, words),
         *_of_checks(inputs, words, statistics),
         *_of_network(inputs, words),
         *_of_coverage(inputs, words, timeline),
@@ -182,12 +185,22 @@ def _spans(station: np.ndarray, rows: np.ndarray, units: Units, words: Words) ->
     return ", ".join(said) + (", …" if len(runs) > 3 else "")
 
 
+def _of_causes(inputs: ReportInputs, units: Units, words: Words) -> list[Remark]:
+    found = (inputs.survey.get("checks") or {}).get("diagnosis") or {}
+    if found.get("state") not in ("named", "cannot tell"):
+        return []
+    best = found["candidates"][0]
+    key = "attention.cause" if found["state"] == "named" else "attention.cause_unclear"
+    sentence = words(key, cause=cause_text(best, words), value=value_text(best, units, words))
+    return [Remark(GRAVE, sentence, "checks")]
+
+
 def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number] | None) -> list[Remark]:
     checks = inputs.table("checks")
     if statistics is None or checks is None:
         return [Remark(SERIOUS, words("attention.no_checks"), "checks")]
     remarks = []
-    z = checks["z"][np.isfinite(checks["z"])]
+    z = checks["z"][counted(checks, None)]
     if off := int((np.abs(z) > CHECK_OFF_SIGMAS).sum()):
         remarks.append(Remark(GRAVE, words("attention.check_off", n=off, all=len(z)), "checks"))
     value = statistics["reduced_chi_square"]["value"]

@@ -14,11 +14,13 @@ from pipeline.report.numbers import column, number
 from pipeline.report.units import Units
 from pipeline.report.words import Words
 from pipeline.surface.design import Design
+from pipeline.tables import NULL_INT
 
 BESIDE_FLOOR_M = 0.3
 """Figures show this much beside the floor: what the edge touched further out says nothing on the trench."""
 MAX_REGULAR_SECTIONS = 9
 WORST_SECTIONS = 3
+_PLAN = ("difference_e", "difference_n", "sigma_e", "sigma_n")
 
 
 def stations_table(stations: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:
@@ -78,27 +80,45 @@ def split_stations(
 
 
 def checks_table(checks: Table, units: Units, words: Words, whole: bool = False) -> dict[str, Any]:
-    """The check-shot table of the page; `whole` for the export: with coordinates, for which paper has no room."""
+    """The check-shot table of the page; `whole` for the export: with all for which paper has no room."""
     length, fall, fine = units.length, units.deviation, units.fine_digits
     columns = [
         column("point", words("columns.point"), kind="id"),
         column("code", words("columns.code"), kind="id"),
+        *(
+            [column("kind", words("columns.check_kind"))]
+            if whole or np.any(checks["kind"] != "floor")
+            else []
+        ),
         column("station", words("columns.station"), length, units.station_digits),
         column("offset", words("columns.offset"), length, units.station_digits, signed=True),
         column("h", words("columns.shot_h"), length, units.length_digits),
         column("as_built_h", words("columns.h"), length, units.length_digits),
         column("difference", words("columns.difference"), fall, fine, signed=True),
-        column("sigma", words("columns.sigma"), fall, fine),
+        column("sigma_own", words("columns.sigma_own"), fall, fine),
+        column("sigma_common", words("columns.sigma_common"), fall, fine),
         column("sigma_ts", words("columns.sigma_ts"), fall, fine),
         column("z", words("columns.z"), "", 1, signed=True),
         column("result", words("columns.result")),
     ]
     if whole:
         columns += [column(key, words(f"columns.{key}"), length, units.length_digits) for key in ("e", "n")]
-    shown = {key: checks[key] for key in ("point", "code", "z", "result")}
+        columns += [column(key, words(f"columns.{key}")) for key in ("edge_point", "time")]
+        columns += [column(key, words(f"columns.{key}"), fall, fine, signed=True) for key in _PLAN[:2]]
+        columns += [column(key, words(f"columns.{key}"), fall, fine) for key in ("sigma", *_PLAN[2:])]
+    shown: dict[str, Any] = {key: checks[key] for key in ("point", "code", "edge_point", "z", "result")}
+    shown["kind"] = [words(f"check_kinds.{kind}") for kind in checks["kind"]]
+    shown["time"] = ["" if t == NULL_INT else numbers.utc_text(t, 1) for t in checks["time_ns"].tolist()]
     shown |= {key: units.to_length(checks[key]) for key in ("station", "offset", "h", "as_built_h", "e", "n")}
-    shown |= {key: units.to_deviation(checks[key]) for key in ("difference", "sigma", "sigma_ts")}
+    falls = ("difference", "sigma", "sigma_own", "sigma_common", "sigma_ts", *_PLAN)
+    shown |= {key: units.to_deviation(checks[key]) for key in falls}
     return numbers.table(columns, numbers.records(shown))
+
+
+def counted(checks: Table, kind: str | None = "floor") -> np.ndarray:
+    """(n,) bool: the shots of a kind, or of all, that the statistics are made of."""
+    compared = np.asarray(checks["result"]) == "compared"
+    return compared if kind is None else compared & (np.asarray(checks["kind"]) == kind)
 
 
 def check_statistics(inputs: ReportInputs, units: Units) -> dict[str, numbers.Number] | None:
@@ -111,8 +131,8 @@ def check_statistics(inputs: ReportInputs, units: Units) -> dict[str, numbers.Nu
         shown[key] = deviation_number(found.get(key), units, signed, fine=True)
     shown["reduced_chi_square"] = number(found.get("reduced_chi_square"), "", 2)
     checks = inputs.table("checks")
-    if checks is not None and np.isfinite(checks["z"]).any():
-        z = checks["z"][np.isfinite(checks["z"])]
+    if checks is not None and counted(checks).any():
+        z = checks["z"][counted(checks)]
         shown["within"] = number(100.0 * float(np.mean(np.abs(z) <= 2.0)), "%", 0)
     return shown
 

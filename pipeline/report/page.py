@@ -16,6 +16,7 @@ from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from pipeline.report import (
+    causes,
     charts,
     detector,
     evidence,
@@ -107,6 +108,8 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "quantities": quantities.quantities(inputs, units, words),
         "sides": quantities.sides_table(inputs, units, words),
         "checks": None if checks is None else measured.checks_table(checks, units, words),
+        "check_kinds": causes.kinds_table(inputs, units, words),
+        "diagnosis": causes.diagnosis(inputs, units, words),
         "check_statistics": _labelled_statistics(statistics, words),
         "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
         "error_budget": evidence.error_budget(inputs, units, words),
@@ -239,7 +242,7 @@ def _figures(
             )
         else:
             add("deviation_map", "as_built", None)
-        compared = 0 if checks is None else int(np.isfinite(checks["difference"]).sum())
+        compared = 0 if checks is None else int(measured.counted(checks).sum())
         if checks is not None and compared:
             add("checks", "", lambda: profiles.check_shots(checks, units), n=compared)
         else:

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from pipeline.report import palette
 from pipeline.report.drawing import WIDTH_IN, decimated, new_figure
 from pipeline.report.inputs import ReportInputs, Table
-from pipeline.report.measured import Grid, Section
+from pipeline.report.measured import Grid, Section, counted
 from pipeline.report.units import Units, text_of
 from pipeline.surface.design import Design
 
@@ -153,7 +153,7 @@ def _shots(
     above: Axes, below: Axes, checks: Table, stations: Table, design: Design | None, units: Units
 ) -> None:
     """Check shots: their elevation above, and below where the shot lies against the design at its station."""
-    on = np.isfinite(checks["station"])
+    on = np.isfinite(checks["station"]) & (np.asarray(checks["kind"]) == "floor")
     if design is not None:
         on &= design.is_floor(checks["station"], checks["offset"])
     station, h = np.asarray(checks["station"], float)[on], np.asarray(checks["h"], float)[on]
@@ -301,7 +301,7 @@ def sides(inputs: ReportInputs, table: Table, units: Units) -> Figure:
 
 def check_shots(checks: Table, units: Units) -> Figure:
     """Difference of each compared shot with two combined sigmas, by station."""
-    compared = np.isfinite(np.asarray(checks["difference"], float))
+    compared = counted(checks)
     x = units.to_length(np.asarray(checks["station"], float)[compared])
     y = units.to_deviation(np.asarray(checks["difference"], float)[compared])
     bar = SIGMAS * units.to_deviation(np.hypot(checks["sigma"], checks["sigma_ts"])[compared])

@@ -1,16 +1,16 @@
 """Which one cause would explain the differences of the check shots: proposed, and never applied.
 
-With the differences ``d ~ N(0, V)`` if nothing is wrong, and ``a`` the signature of a cause, its value by least squares
-is ``b = a' V^-1 d / a' V^-1 a`` with ``sigma_b² = 1 / a' V^-1 a``, and ``w = b / sigma_b`` is standard normal if nothing
-is wrong (Baarda's test of data snooping, with any signature in place of a single outlier). Of c causes the largest w
-passes ``w_crit``, at which all of them together speak falsely in 5 of 100 jobs (Šidák). The global test ``d' V^-1 d`` is
-told beside it and decides nothing: it looks in as many directions as there are components, and of a cause that w
-sees in 80 of 100 jobs (of 12 causes) it sees 47 with 30 shots and 24 with 100.
+With the differences ``d ~ N(0, V)`` if nothing is wrong, and ``a`` the signature of a cause, its value by least
+squares is ``b = a' V^-1 d / a' V^-1 a`` with ``sigma_b² = 1 / a' V^-1 a``, and ``w = b / sigma_b`` is standard normal
+if nothing is wrong (Baarda's test of data snooping, with any signature in place of a single outlier). Of c causes the
+largest w passes ``w_crit``, at which all of them together speak falsely in 5 of 100 jobs (Šidák). The global test
+``d' V^-1 d`` is told beside it and decides nothing: it looks in as many directions as there are components, and of a
+cause that w sees in 80 of 100 jobs (of 12 causes) it sees 47 with 30 shots and 24 with 100.
 
-Two causes with the correlation ``r = a_i' V^-1 a_j sigma_i sigma_j`` are told apart by what the second does not explain
-of the first, ``u = (w_i - r w_j) / sqrt(1 - r²)``: standard normal if the second is the cause. A cause is named if it is
-the most significant one, passes ``w_crit``, and ``|u|`` passes 1.96 against every cause of another name. So
-a job whose cause is j is given the name i in less than 5 of 100.
+Two causes with the correlation ``r = a_i' V^-1 a_j sigma_i sigma_j`` are told apart by what the second does not
+explain of the first, ``u = (w_i - r w_j) / sqrt(1 - r²)``: standard normal if the second is the cause. A cause is named
+if it is the most significant one, passes ``w_crit``, and ``|u|`` passes 1.96 against every cause of another name. So a
+job whose cause is j is given the name i in less than 5 of 100.
 """
 
 from __future__ import annotations

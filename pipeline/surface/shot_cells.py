@@ -35,7 +35,9 @@ ORDERS = {
 }
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
-_ALIGNED = re.compile(r"\s*(\S+)" + r"\s+([+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+))" * 3 + r"(?:\s+(.*))?")
+_WORD = r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)"
+_ALIGNED = re.compile(rf"\s*(\S+)\s+({_WORD})\s+({_WORD})\s+({_WORD})(?:\s+(?!{_WORD}(?:\s|$))(.*))?\s*")
+"""A fourth number would leave open whether the name has a blank in it."""
 _PLAIN_HEADINGS = {*HEADINGS, "x", "y"}
 _TIME = re.compile(
     r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d(:\d\d([.,]\d{1,9})?)?\s*(Z|[+-]\d\d(:?\d\d)?)?", re.IGNORECASE

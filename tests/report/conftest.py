@@ -185,6 +185,12 @@ def checks_table(rng, n=9):
     return {
         "point": np.array([f"{i:03d}" for i in range(1, n)] + [HOSTILE], object),
         "code": np.array(["FLOOR"] * (n - 1) + ["</table>"], object),
+        "kind": np.full(n, "floor", object),
+        "edge_point": np.full(n, "", object),
+        "time_ns": np.full(n, T0),
+        **{name: np.full(n, np.nan) for name in ("difference_e", "difference_n", "sigma_e", "sigma_n")},
+        "sigma_own": 0.6 * sigma,
+        "sigma_common": 0.8 * sigma,
         "e": ORIGIN_M[0] + (s - 100),
         "n": ORIGIN_M[1] + (s - 100) / 3,
         "h": h,
@@ -377,9 +383,54 @@ SOLUTION = {
     "correlation_time_s": {"median": 0.31, "longest": 2.4, "digging": 0.31, "bridged": 1.72},
     "warnings": ["benchmark BM2 moved 3.5 sigma from its file value"],
 }
+CHECKED = {"n": 8, "bias": 0.0021, "rmse": 0.0049, "worst": -0.0092, "reduced_chi_square": 0.83}
+
+
+def candidate(kind, name="", component="", unit="m", value=0.012, w=6.0):
+    """One cause of a diagnosis, as survey.json has it."""
+    return {
+        "kind": kind, "name": name, "component": component, "unit": unit, "value": value,
+        "sigma": value / w, "w": w, "p_value": 1e-8, "left_p_value": 0.4, "seen_from": 0.008, "told_from": None,
+        "plausible": True,
+    }  # fmt: skip
+
+
 SURVEY = {
     "verdict": "FAIL",
-    "checks": {"n": 8, "bias": 0.0021, "rmse": 0.0049, "worst": -0.0092, "reduced_chi_square": 0.83},
+    "checks": {
+        **CHECKED,
+        "kinds": {
+            "floor": {
+                **CHECKED,
+                "horizontal_rmse": None,
+                "shots": 9,
+                "global_test": {"statistic": 7.1, "components": 8, "p_value": 0.5251},
+            },
+            "control": {
+                **dict.fromkeys(("bias", "rmse", "worst", "horizontal_rmse"), 0.004),
+                "n": 1,
+                "reduced_chi_square": 0.5,
+                "shots": 2,
+                "global_test": {"statistic": 2.2, "components": 2, "p_value": 0.3329},
+            },
+        },
+        "diagnosis": {
+            "state": "named",
+            "named": candidate("wear"),
+            "rivals": [],
+            "telling_shot": None,
+            "global_test": {"statistic": 44.0, "components": 8, "p_value": 6e-7},
+            "critical": 2.6,
+            "common_factors": True,
+            "candidates": [
+                candidate("wear"),
+                candidate("time offset", "pot", unit="s", value=-0.02, w=-1.2),
+                candidate("sensor", "pot", unit="deg", value=0.31, w=1.0),
+                candidate("benchmark", "B<2>", "n", value=0.03, w=0.5),
+                candidate("datum", component="h", value=-0.003, w=-0.2),
+            ],
+        },
+    },
 }
 
 
