@@ -36,7 +36,7 @@ ORDERS = {
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+")
 _WORD = r"[+-]?(?:\d+(?:[.,]\d*)?|[.,]\d+)"
-_ALIGNED = re.compile(rf"\s*(\S+)\s+({_WORD})\s+({_WORD})\s+({_WORD})(?:\s+(?!{_WORD}(?:\s|$))(.*))?\s*")
+_ALIGNED = re.compile(rf"\s*(\S+)\s+({_WORD})\s+({_WORD})\s+({_WORD})(?:\s+(?!\s|{_WORD}(?:\s|$))(.*))?\s*")
 """A fourth number would leave open whether the name has a blank in it."""
 _PLAIN_HEADINGS = {*HEADINGS, "x", "y"}
 _TIME = re.compile(
