@@ -234,7 +234,7 @@ def _separated(text: str, separator: str, source: str) -> Iterator[Row]:
 def _is_aligned(lines: list[str]) -> bool:
     """Whether each line, but for a heading, is a name without blanks, three numbers and perhaps more."""
     body = lines[1:] if lines and not _ALIGNED.fullmatch(lines[0]) and _titles(lines[0]) else lines
-    return bool(body) and all(_ALIGNED.fullmatch(line) for line in body)
+    return bool(body) and all(len(line) < 1000 and _ALIGNED.fullmatch(line) for line in body)
 
 
 def _titles(line: str) -> bool:

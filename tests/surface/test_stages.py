@@ -120,12 +120,11 @@ def job_of(folder):
     )  # fmt: skip
 
 
-def run_both(folder, **how):
+def run_both(folder, answer=None, **how):
     job, watch = job_of(folder), Watch()
     tables.write_table(job.folder.file("states.parquet"), "states", states(**how))
-    tables.write_table(
-        job.folder.file("sensitivities.parquet"), "sensitivities", tables.empty_columns("sensitivities")
-    )
+    answer = tables.empty_columns("sensitivities") if answer is None else answer
+    tables.write_table(job.folder.file("sensitivities.parquet"), "sensitivities", answer)
     job.folder.file("solution.json").write_text(json.dumps({"correlation_time_s": {"median": 0.4}}))
     tracked = track.run(job.at(stage_named("track"), "f" * 64), watch)
     surveyed = survey.run(job.at(stage_named("survey"), "f" * 64), watch)
@@ -170,6 +169,56 @@ def test_a_trench_not_yet_dug_is_not_reached_and_not_failed(folder):
     assert facts["counts"]["NOT REACHED"] == 11
     assert any("came no lower than 1.20 (m) above the design" in sentence for sentence in watch.warnings)
     assert facts["deviation"]["mean"] is None and facts["checks"]["n"] == 0
+
+
+def responses():
+    """Worn teeth lift the edge, in the second pass twice as much as in the first; one common error of 3 mm."""
+    time_ns = np.unique(states()["time_ns"])
+    lift = np.where(np.arange(len(time_ns)) < len(time_ns) // 2, 1.0, 2.0)
+    columns = {name: np.zeros(2 * len(time_ns), np.float32) for name in ("e", "n", "h", "re", "rn", "rh")}
+    columns["h"] = np.column_stack([lift, np.full(len(lift), 0.003)]).ravel().astype(np.float32)
+    columns["time_ns"] = np.repeat(time_ns, 2)
+    for name, words in (("source", ("wear", "common")), ("name", ("", "1")), ("component", ("", ""))):
+        columns[name] = np.tile(np.array(words, object), len(time_ns))
+    columns["unit"] = np.tile(np.array(("m", "sigma"), object), len(time_ns))
+    return columns
+
+
+def test_checks_of_every_kind_and_the_cause_that_would_explain_them(folder):
+    """All stands 40 mm too high: so would a datum have it. Worn teeth would, too, were it not for the second pass."""
+    (folder / "site.toml").write_text(
+        SITE.replace(
+            'order = "PNEZD"',
+            'order = "named"\nused_in_calibration = ["CAL"]\n'
+            "control.CP1 = { enh = [512000, 4123090, 50], sigma_mm = 3 }",
+        )
+        + '[report]\ntime_zone = "Europe/Helsinki"\n'
+    )
+    rows = [f"{i:03d},{4123003 + i},512000.1,{50.0 - 0.04},FL,,floor" for i in range(4)]
+    rows += ["C1,4123004,512000.1,40,CAL,,floor", "E1,4123004,512000,50,CE middle,2025-06-15 18:06:41,edge"]
+    (folder / "checks.csv").write_text(
+        "\n".join(["point,northing,easting,elevation,code,time,kind", *rows, ""])
+    )
+    job, watch, _, surveyed, facts = run_both(folder, responses())
+    assert watch.warnings == [] and surveyed["check shots"] == 7 and surveyed["of these compared"] == 4
+    checks = tables.read_table(job.folder.file("checks.parquet"), "checks")
+    assert checks["result"].tolist() == [
+        *["compared"] * 4, "used in calibration", "edge not still", "edge not set down",
+    ]  # fmt: skip
+    assert checks["kind"].tolist() == ["floor"] * 5 + ["edge", "control"] and checks["point"][6] == "CP1"
+    assert checks["time_ns"][0] > 0 and checks["time_ns"][5] == tables.NULL_INT
+    found = facts["checks"]
+    assert (found["n"], found["used_in_calibration"]) == (4, 1)
+    assert {kind: each["n"] for kind, each in found["kinds"].items()} == {"floor": 4, "edge": 0, "control": 0}
+    diagnosis = found["diagnosis"]
+    # Four shots of the floor cannot tell the two: their passes are all the first or the second one.
+    assert diagnosis["state"] == "cannot tell" and diagnosis["common_factors"]
+    by_kind = {each["kind"]: each for each in diagnosis["candidates"]}
+    assert by_kind["datum"]["value"] == pytest.approx(0.04, abs=0.002)
+    lift = -by_kind["datum"]["value"] / by_kind["wear"]["value"]
+    assert lift == pytest.approx(1.0, abs=0.01) or lift == pytest.approx(2.0, abs=0.01)
+    assert diagnosis["telling_shot"]["kind"] == "edge"
+    assert diagnosis["telling_shot"]["apart_sigmas"] > 3
 
 
 def test_a_site_without_checks_has_an_empty_table_and_no_statistics(folder):
