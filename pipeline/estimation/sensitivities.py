@@ -93,7 +93,7 @@ class Gathered:
         ends = [L[:, :3]]
         for side in (-1.0, 1.0):
             ends.append(L[:, :3] + np.cross(L[:, 3:], side * along[:, :, None], axis=1))
-        flat = np.concatenate(ends, axis=1).reshape(-1, L.shape[2])
+        flat = np.concatenate(ends, axis=1).reshape(9 * len(L), L.shape[2])
         gram = flat.T @ flat
         whole = float(np.trace(gram))
         plane = np.zeros((L.shape[2], 0)) if self.plane is None else self.plane

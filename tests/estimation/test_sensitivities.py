@@ -13,7 +13,7 @@ from pipeline.estimation.parts import bounds
 from pipeline.estimation.published import published
 from pipeline.estimation.table import columns_of_sensitivities, sensitivities_from_columns
 from pipeline.geometry import so3
-from tests.estimation.simulator import MACHINE, SITE, Options, draw
+from tests.estimation.simulator import MACHINE, SITE, Options, draw, exact
 from tests.estimation.test_adjust import NO_LOSS, _problem
 
 OPTIONS = Options(epochs=25)
@@ -146,3 +146,15 @@ def test_the_table_gives_back_what_was_written():
     assert back.sources == told.sources
     np.testing.assert_array_equal(back.time_ns, told.time_ns)
     np.testing.assert_array_equal(back.response, told.response)
+
+
+def test_exact_files_have_no_common_error_and_only_teeth_that_wear():
+    options = Options(epochs=6, machine=exact(MACHINE), site=exact(SITE))
+    problem = _problem(draw(8, options))
+    assert problem.statics.size == 0
+    told = published(problem, optimise(problem, NO_LOSS, 30), 0.3).sensitivities
+    assert [s.kind for s in told.sources] == ["wear"]
+    assert (
+        np.allclose(np.linalg.norm(told.response[:, 0, :3], axis=1), 1.0)
+        and not told.response[:, 0, 3:].any()
+    )
