@@ -12,6 +12,7 @@ by: what a part of the log does not share with the plane so far, if it is more t
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,6 +53,12 @@ class Sensitivities:
     response: np.ndarray
     """(n, len(sources), 6) float32: shift of the edge's middle along e n h, and turn about these axes; metres and
     radians per unit of the source. Of a factor: per standard deviation; they are independent."""
+
+    def portions(self, epochs: int) -> Iterator[Sensitivities]:
+        """So many epochs at a time."""
+        for start in range(0, len(self.time_ns), epochs):
+            rows = slice(start, start + epochs)
+            yield Sensitivities(self.time_ns[rows], self.sources, self.response[rows])
 
 
 class Gathered:

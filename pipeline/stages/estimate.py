@@ -26,8 +26,9 @@ from pipeline.logs.clock import EARLIEST_NS
 from pipeline.network import network_of
 from pipeline.runs import atomic_file
 from pipeline.stages.job import Counts, Job, Progress
-from pipeline.tables import empty_columns
 
+PORTION_EPOCHS = 8192
+"""Of the table of sensitivities, which has some twenty rows an epoch."""
 WORTH_S = 1.0
 """An iteration that took less than this is not kept."""
 
@@ -53,10 +54,9 @@ def run(job: Job, progress: Progress) -> Counts:
     job.write_table("statics", columns_of_statics(solution.statics))
     job.write_table("residuals", columns_of_residuals(network, solution.residuals))
     answer = solution.sensitivities
-    job.write_table(
-        "sensitivities",
-        empty_columns("sensitivities") if answer is None else columns_of_sensitivities(answer),
-    )
+    with job.table_writer("sensitivities") as writer:
+        for portion in () if answer is None else answer.portions(PORTION_EPOCHS):
+            writer.write(columns_of_sensitivities(portion))
     job.write_json("solution.json", solution.diagnostics)
     progress.advance(1)
     for sentence in solution.warnings:
