@@ -23,6 +23,7 @@ from pipeline.runs import atomic_file
 
 if TYPE_CHECKING:
     import pyarrow as pa
+    import pyarrow.parquet as pq
 
 Columns = Mapping[str, Any]
 
@@ -172,8 +173,20 @@ class TableWriter:
         self._writer.close()
 
 
-def read_table(path: Path, name: str, columns: list[str] | None = None) -> dict[str, np.ndarray]:
+def read_table(
+    path: Path, name: str, columns: list[str] | None = None, at_ns: np.ndarray | None = None
+) -> dict[str, np.ndarray]:
     """Columns of a table by name, all of them or those asked for.
+
+    Parameters
+    ----------
+    path, name
+        As for `write_table`.
+    columns : list of str, optional
+        Those that are wanted.
+    at_ns : (k,) int64 array, optional
+        Only rows whose `time_ns` is one of these. Row groups of other times are not read, and one is in memory at
+        a time: a few instants of a shift cost a few row groups.
 
     Returns
     -------
@@ -202,7 +215,8 @@ def read_table(path: Path, name: str, columns: list[str] | None = None) -> dict[
             )
         words = [column.name for column in chosen if column.type == "string"]
         with pq.ParquetFile(path, read_dictionary=words, page_checksum_verification=True) as file:
-            table = file.read(columns=[column.name for column in chosen])
+            names = [column.name for column in chosen]
+            table = file.read(columns=names) if at_ns is None else _rows_at(file, names, at_ns)
         return {column.name: _to_numpy(table[column.name], column) for column in chosen}
     except FileNotFoundError:
         raise ArtefactError(f"{path} is missing; run 'gradetrace report' again to make it") from None
@@ -211,6 +225,27 @@ def read_table(path: Path, name: str, columns: list[str] | None = None) -> dict[
         raise ArtefactError(
             f"{path} is damaged ({reason}); delete it and run 'gradetrace report' again to make it anew"
         ) from error
+
+
+def _rows_at(file: pq.ParquetFile, names: list[str], at_ns: np.ndarray) -> pa.Table:
+    """Rows of some instants, in the order of the file."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    at_ns = np.unique(np.asarray(at_ns, np.int64))
+    wanted = pa.array(at_ns, pa.int64())
+    place = file.schema_arrow.get_field_index("time_ns")
+    assert place >= 0, "only tables with time_ns can be asked for instants"
+    found = [file.schema_arrow.empty_table().select(names)]
+    for group in range(file.num_row_groups):
+        limits = file.metadata.row_group(group).column(place).statistics
+        if limits is not None and limits.has_min_max:
+            first, last = np.searchsorted(at_ns, [limits.min, limits.max + 1])
+            if first == last:
+                continue
+        rows = file.read_row_group(group, columns=[*dict.fromkeys([*names, "time_ns"])])
+        found.append(rows.filter(pc.is_in(rows["time_ns"], wanted)).select(names))
+    return pa.concat_tables(found)
 
 
 def table_metadata(path: Path) -> dict[str, str]:

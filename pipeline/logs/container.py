@@ -100,14 +100,25 @@ def read_contents(path: Path) -> Contents:
     LogError
         No such file, an empty one, or one that is no MCAP.
     """
+    found = indexed_contents(path)
+    if found is None:
+        with path.open("rb") as file:
+            found = _by_walking(path, file, _size_of(path))
+    return found
+
+
+def indexed_contents(path: Path) -> Contents | None:
+    """The same by the log's own summary alone, in no time; None where it has none that can be used.
+
+    Raises LogError as `read_contents` does.
+    """
     size = _size_of(path)
     with path.open("rb") as file:
         _check_magic(path, file.read(64))
         try:
-            contents = _from_summary(path, file, size)
+            return _from_summary(path, file, size)
         except (Damaged, *UNREADABLE):
-            contents = None
-        return contents or _by_walking(path, file, size)
+            return None
 
 
 def _size_of(path: Path) -> int:

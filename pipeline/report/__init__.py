@@ -5,7 +5,7 @@ artefacts of a run; nothing is measured again here. The page asks nothing of any
 JavaScript, and the same artefacts give the same bytes.
 """
 
-from pipeline.report.inputs import FileSource, ReportInputs
+from pipeline.report.inputs import FileSource, ReportInputs, View
 from pipeline.report.page import Page, render
 
-__all__ = ["FileSource", "Page", "ReportInputs", "render"]
+__all__ = ["FileSource", "Page", "ReportInputs", "View", "render"]

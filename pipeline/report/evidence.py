@@ -10,6 +10,7 @@ import numpy as np
 
 from pipeline.report import numbers
 from pipeline.report.facts import edge_gaps, span_ns
+from pipeline.report.idle import idle_spans
 from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.numbers import column, number
 from pipeline.report.units import Units
@@ -38,12 +39,19 @@ class Timeline:
     """Camera -> (n,) accepted tags per bin."""
     gaps_ns: np.ndarray
     """(g, 2) spans in which the cutting edge was not observed."""
+    idle_ns: np.ndarray
+    """(s, 2) spans in which it stood still."""
     start_ns: int
 
     @property
     def bridged_s(self) -> float:
         """Seconds of all gaps."""
         return float((self.gaps_ns[:, 1] - self.gaps_ns[:, 0]).sum() / 1e9)
+
+    @property
+    def idle_s(self) -> float:
+        """Seconds of all spans in which it stood still."""
+        return float((self.idle_ns[:, 1] - self.idle_ns[:, 0]).sum() / 1e9)
 
 
 def timeline_of(inputs: ReportInputs, bins: int = MAX_BINS) -> Timeline | None:
@@ -62,10 +70,10 @@ def timeline_of(inputs: ReportInputs, bins: int = MAX_BINS) -> Timeline | None:
         times = found["time_ns"][found["status"] == "accepted"] if found else np.zeros(0, np.int64)
         accepted[camera] = _count((times - start) / 1e9, edges)
     edge = inputs.table("cutting_edge")
-    gaps = np.zeros((0, 2), np.int64)
+    gaps = idle = np.zeros((0, 2), np.int64)
     if edge is not None:
-        gaps = edge_gaps(inputs, edge, span)
-    return Timeline(edges, seen_frames, accepted, gaps, start)
+        gaps, idle = edge_gaps(inputs, edge, span), idle_spans(edge, start)
+    return Timeline(edges, seen_frames, accepted, gaps, idle, start)
 
 
 def _count(seconds: np.ndarray, edges: np.ndarray) -> np.ndarray:
@@ -109,16 +117,8 @@ def coverage(inputs: ReportInputs, words: Words) -> dict[str, Any]:
 def _gaps_and_time(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     coarse = timeline_of(inputs, MAX_TABLE_BINS)
     if coarse is None:
-        return {"gaps": None, "gap_count": None, "bridged": None, "time": None}
-    longest = sorted(coarse.gaps_ns.tolist(), key=lambda gap: gap[0] - gap[1])[:MAX_GAPS]
-    gap_rows = [
-        {
-            "start": numbers.utc_text(start, 1)[11:-4],
-            "end": numbers.utc_text(end, 1)[11:-4],
-            "seconds": (end - start) / 1e9,
-        }
-        for start, end in sorted(longest)
-    ]
+        names = ("gaps", "gap_count", "bridged", "idle", "idle_count", "idle_total", "time")
+        return dict.fromkeys(names)
     columns = [column("start", words("columns.start"))]
     rows: list[dict[str, Any]] = [
         {"start": numbers.utc_text(coarse.start_ns + int(t * 1e9))[11:-4]} for t in coarse.edges_s[:-1]
@@ -129,17 +129,34 @@ def _gaps_and_time(inputs: ReportInputs, words: Words) -> dict[str, Any]:
         for row, count, tags in zip(rows, coarse.frames[camera], coarse.accepted[camera]):
             row[f"frames_{i}"] = int(count)
             row[f"tags_{i}"] = tags / count if count else None
-    gap_columns = [
+    return {
+        "gaps": _longest(coarse.gaps_ns, words),
+        "gap_count": number(len(coarse.gaps_ns)),
+        "bridged": number(coarse.bridged_s, "s", 1),
+        "idle": _longest(coarse.idle_ns, words),
+        "idle_count": number(len(coarse.idle_ns)),
+        "idle_total": number(coarse.idle_s, "s", 1),
+        "time": numbers.table(columns, rows),
+    }
+
+
+def _longest(spans_ns: np.ndarray, words: Words) -> dict[str, Any]:
+    """The longest spans in the order of time."""
+    longest = sorted(spans_ns.tolist(), key=lambda span: span[0] - span[1])[:MAX_GAPS]
+    rows = [
+        {
+            "start": numbers.utc_text(start, 1)[11:-4],
+            "end": numbers.utc_text(end, 1)[11:-4],
+            "seconds": (end - start) / 1e9,
+        }
+        for start, end in sorted(longest)
+    ]
+    columns = [
         column("start", words("columns.start")),
         column("end", words("columns.end")),
         column("seconds", words("columns.seconds"), "s", 1),
     ]
-    return {
-        "gaps": numbers.table(gap_columns, gap_rows),
-        "gap_count": number(len(coarse.gaps_ns)),
-        "bridged": number(coarse.bridged_s, "s", 1),
-        "time": numbers.table(columns, rows),
-    }
+    return numbers.table(columns, rows)
 
 
 def residual_histogram(inputs: ReportInputs) -> tuple[np.ndarray, np.ndarray] | None:

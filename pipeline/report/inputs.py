@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from pipeline.config import Machine, Site
+from pipeline.report.moments import Moment
 from pipeline.surface.alignment import Alignment
 from pipeline.surface.design import Design
 
@@ -23,6 +24,26 @@ class FileSource:
     origin: str
     """Where it came from: a path as the user wrote it, or ``attachment of the log``."""
     sha256: str
+
+
+@dataclass(frozen=True)
+class View:
+    """What one camera saw when the floor of one of the worst stations was made."""
+
+    stations: tuple[float, ...]
+    """Metres; several where one frame is the nearest to the moments of several."""
+    camera: str
+    time_ns: int
+    """Capture stamp of the frame; the moment itself where there is none."""
+    width: int = 0
+    """Pixels of the camera's own picture, in which corners are given."""
+    height: int = 0
+    jpeg: bytes = b""
+    """The picture, shrunk; empty where `why` tells why."""
+    why: str = ""
+    tags: Table = field(default_factory=dict)
+    """One row per tag found in the frame: tag, marker, status (all text), uv and predicted (n, 4, 2) px, normalised
+    (n,) the largest of its corners, and weight (n,) the least; NaN in the last three where the adjustment has none."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +65,10 @@ class ReportInputs:
     """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, sides, volumes, checks."""
     detections: Mapping[str, Table] = field(default_factory=dict)
     """By camera; columns time_ns, tag_id and status."""
+    moments: Sequence[Moment] = ()
+    """When the floor of the worst stations was made."""
+    views: Sequence[View] = ()
+    """Pictures of those moments."""
     log_facts: Mapping[str, Any] = field(default_factory=dict)
     """log.json."""
     detection: Mapping[str, Any] = field(default_factory=dict)

@@ -10,6 +10,7 @@ import numpy as np
 from pipeline.report import numbers
 from pipeline.report.facts import deviation_number
 from pipeline.report.inputs import ReportInputs, Table
+from pipeline.report.moments import worst_rows
 from pipeline.report.numbers import column, number
 from pipeline.report.units import Units
 from pipeline.report.words import Words
@@ -19,7 +20,6 @@ from pipeline.tables import NULL_INT
 BESIDE_FLOOR_M = 0.3
 """Figures show this much beside the floor: what the edge touched further out says nothing on the trench."""
 MAX_REGULAR_SECTIONS = 9
-WORST_SECTIONS = 3
 _PLAN = ("difference_e", "difference_n", "sigma_e", "sigma_n")
 
 
@@ -219,9 +219,8 @@ def sections_of(inputs: ReportInputs, grid: Grid) -> list[Section]:
         regular = regular[np.linspace(0, len(regular) - 1, MAX_REGULAR_SECTIONS).round().astype(int)]
     wanted = {round(float(station), 6): "regular" for station in regular}
     if stations is not None:
-        dug = np.flatnonzero(np.isfinite(stations["deviation"]))
-        worst = dug[np.argsort(-np.abs(stations["deviation"][dug]), kind="stable")][:WORST_SECTIONS]
-        wanted |= {round(float(station), 6): "worst" for station in stations["station"][worst]}
+        worst = stations["station"][worst_rows(stations)]
+        wanted |= {round(float(station), 6): "worst" for station in worst}
     sections = [_section(grid, station, why, inputs.design) for station, why in sorted(wanted.items())]
     return [section for section in sections if np.isfinite(section.h[section.floor]).any()]
 

@@ -21,12 +21,14 @@ from pipeline.report import (
     detector,
     evidence,
     facts,
+    histograms,
     maps,
     measured,
     numbers,
     palette,
     profiles,
     quantities,
+    views,
 )
 from pipeline.report.attention import attention
 from pipeline.report.consistency import consistency
@@ -34,7 +36,7 @@ from pipeline.report.drawing import house_style, svg_of
 from pipeline.report.evidence import Timeline
 from pipeline.report.hand_off import AS_BUILT_POINTS, files_table, hand_off_of, points_table
 from pipeline.report.identity import identity, settings
-from pipeline.report.inputs import ReportInputs
+from pipeline.report.inputs import ReportInputs, Table
 from pipeline.report.provenance import method, provenance
 from pipeline.report.report_file import FORMAT
 from pipeline.report.units import Units, text_of, units_of
@@ -129,8 +131,21 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         name: words("page.not_available", why=inputs.why_missing(name))
         for name in ("stations", "as_built", "checks", "residuals", "statics", "frames", "solution.json")
     }
+    shots, cells = _histograms(inputs, grid, units)
+    content["check_residuals"] = shots and histograms.check_residuals_table(shots, words)
+    content["cell_deviations"] = cells and histograms.cell_deviations_table(cells, units, words)
     pictures, content["figures"] = _figures(inputs, units, words, grid, timeline, sections)
-    return content, pictures
+    content["evidence"], frames, about = views.evidence(inputs, units, words)
+    content["figures"] |= about
+    return content, pictures | frames
+
+
+def _histograms(
+    inputs: ReportInputs, grid: measured.Grid | None, units: Units
+) -> tuple[histograms.Histogram | None, histograms.Histogram | None]:
+    """Of the check shots and of the cells."""
+    cells = None if grid is None else histograms.cell_deviations(inputs, grid, units)
+    return histograms.check_residuals(inputs), cells
 
 
 def _exports(inputs: ReportInputs, units: Units, words: Words) -> dict[str, dict[str, Any]]:
@@ -265,6 +280,8 @@ def _figures(
                 cameras=len(timeline.frames),
                 gaps=len(timeline.gaps_ns),
                 seconds=numbers.duration_text(timeline.bridged_s),
+                spells=len(timeline.idle_ns),
+                idle=numbers.duration_text(timeline.idle_s),
             )
         else:
             add("coverage", "frames", None)
@@ -290,7 +307,40 @@ def _figures(
             )
         else:
             add("residuals", "residuals", None)
+        shots, cells = _histograms(inputs, grid, units)
+        add(
+            "check_residuals",
+            "checks",
+            (lambda: charts.check_residuals(shots)) if shots else None,
+            n=0 if shots is None else int(shots.count.sum()),
+        )
+        tolerance = inputs.site.tolerance
+        high, low = tolerance.high_mm / 1000, tolerance.low_mm / 1000
+        band = (-float(units.to_deviation(low)), float(units.to_deviation(high)))
+        add(
+            "cell_deviations",
+            "as_built",
+            (lambda: charts.cell_deviations(cells, band, units)) if cells else None,
+            n=0 if cells is None else int(cells.count.sum()),
+            low=facts.deviation_text(-low, units, fine=True),
+            high=facts.deviation_text(high, units, fine=True),
+        )
+        limit = (high + low) / 2 / tolerance.coverage_factor
+        add(
+            "uncertainty",
+            "stations",
+            (lambda: charts.uncertainty(stations, limit, units)) if stations is not None else None,
+            own=facts.deviation_text(_median(stations, "sigma_own"), units, signed=False, fine=True),
+            common=facts.deviation_text(_median(stations, "sigma_common"), units, signed=False, fine=True),
+            limit=facts.deviation_text(limit, units, signed=False, fine=True),
+        )
     return pictures, about
+
+
+def _median(stations: Table | None, name: str) -> float | None:
+    """Of a column of the stations that were dug; None without any."""
+    known = np.zeros(0) if stations is None else stations[name][np.isfinite(stations[name])]
+    return float(np.median(known)) if len(known) else None
 
 
 def _num(value: numbers.Number, key: str) -> Markup:

@@ -36,6 +36,9 @@ LOW_TO_HIGH = (
     "#b85300",
     "#6b2f00",
 )
+DETECTED = "#ffffff"
+PREDICTED = "#f2a95c"
+"""Lines on a picture lie on a wider one of INK, so that they show on bright and on dark ground."""
 NEVER_TOUCHED = "#ffffff"
 PASSED_OVER = "#c9ced3"
 

@@ -100,11 +100,15 @@ class Job:
         return self.folder.scratch(self.stage.name, self.fingerprint)
 
     def read_table(
-        self, name: str, columns: list[str] | None = None, part: str | None = None
+        self,
+        name: str,
+        columns: list[str] | None = None,
+        part: str | None = None,
+        at_ns: np.ndarray | None = None,
     ) -> dict[str, np.ndarray]:
-        """Columns of a table that an earlier stage wrote. Raises ArtefactError."""
+        """Columns of a table that an earlier stage wrote, of some instants only if asked. Raises ArtefactError."""
         self._may_read(next((s for s in self._needs() if name in stage_named(s).tables), None), name)
-        return tables.read_table(self.folder.file(table_file(name, part)), name, columns)
+        return tables.read_table(self.folder.file(table_file(name, part)), name, columns, at_ns)
 
     def parts(self, name: str) -> list[str]:
         """The parts of a table that comes in several files, for example the cameras of `detections`."""

@@ -13,8 +13,10 @@ from pipeline.errors import ArtefactError
 from pipeline.report import FileSource, ReportInputs, render
 from pipeline.report.exports import csv_of
 from pipeline.report.hand_off import AS_BUILT_POINTS, DXF, LANDXML
+from pipeline.report.moments import worst_moments
 from pipeline.stages import STAGES
 from pipeline.stages.job import Counts, Job, Progress, Source
+from pipeline.stages.pictures import views_of
 from pipeline.surface.design import read_design
 from pipeline.surface.drawing_exchange import dxf_bytes
 from pipeline.surface.landxml_out import landxml_bytes
@@ -23,7 +25,7 @@ COLUMNS: dict[str, list[str] | None] = {
     "frames": ["camera", "time_ns"],
     "residuals": ["camera", "marker", "residual_u", "residual_v", "normalised", "weight"],
     "statics": None,
-    "cutting_edge": ["time_ns", "point", "seen"],
+    "cutting_edge": ["time_ns", "point", "e", "n", "h", "seen"],
     "as_built": None,
     "stations": None,
     "sides": None,
@@ -98,6 +100,10 @@ def gather(job: Job) -> ReportInputs:
                 "counts": manifest.counts,
                 "warnings": manifest.warnings,
             }
+    moments = []
+    if (stations := tables.get("stations")) and (cells := tables.get("as_built")):
+        floor = design.is_floor(cells["station"], cells["offset"])
+        moments = worst_moments(stations, cells, floor, job.site.station_step_m)
     return ReportInputs(
         machine=job.machine,
         site=job.site,
@@ -113,6 +119,8 @@ def gather(job: Job) -> ReportInputs:
             for camera in job.machine.cameras
             if camera in cameras
         },
+        moments=moments,
+        views=views_of(job, moments) if moments and "frames" in tables else (),
         log_facts=facts["log.json"],
         detection=facts["detection.json"],
         solution=facts["solution.json"],

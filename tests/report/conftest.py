@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from pipeline.config import load_machine, load_site
-from pipeline.report import FileSource, ReportInputs
+from pipeline.detection.preview import preview_jpeg
+from pipeline.report import FileSource, ReportInputs, View
+from pipeline.report.moments import Moment
 from pipeline.surface.alignment import polyline
 
 T0 = 1_790_000_000_000_000_000
@@ -240,9 +242,16 @@ def log_tables(rng, seconds=120, rate=5):
         "normalised": whitened,
         "weight": np.minimum(1.0, 2.5 / whitened),
     }
+    # Strokes of the edge, and from the 70th to the 90th second it waits.
+    t = np.arange(n) / rate
+    stroke = np.where((t >= 70) & (t < 90), 0.0, np.sin(2 * np.pi * (t - 70) / 16))
+    middle = np.stack([4 * stroke, 1.5 * stroke, -1 + 0.5 * stroke], axis=1) + ORIGIN_M
+    points = middle[:, None] + np.array([[-0.6, 0, 0], [0, 0, 0], [0.6, 0, 0]])
+    points = (points + rng.normal(0, 0.003, points.shape)).reshape(-1, 3)
     edge = {
         "time_ns": np.repeat(times, 3),
         "point": np.array(["left", "middle", "right"] * n, object),
+        **dict(zip("enh", points.T)),
         "seen": np.repeat(seen, 3),
     }
     return frames, detections, residuals, edge
@@ -261,10 +270,40 @@ STATICS = {
 }
 
 
+def square(u, v, side):
+    """(4, 2) corners of an upright tag."""
+    return np.array([[u, v], [u + side, v], [u + side, v + side], [u, v + side]], float)
+
+
+def view(stations=(106.25,), camera="bench", seed=0):
+    """A frame of noise with a tag that was used, one left out as gross and one that is covered."""
+    rng = np.random.default_rng(seed)
+    uv = np.stack([square(100, 120, 60), square(300, 200, 40), square(420, 90, 30)])
+    predicted = uv + np.array([0.3, -0.4])
+    predicted[1] += 3.0
+    predicted[2] = np.nan
+    tags = {
+        "tag": np.array(["tag36h11 1", "tag36h11 2", "tag36h11 11"], object),
+        "marker": np.array(["BM1", "BM2", "stick"], object),
+        "status": np.array(["accepted", "accepted", "covered"], object),
+        "uv": uv,
+        "predicted": predicted,
+        "normalised": np.array([1.2, 27.0, np.nan]),
+        "weight": np.array([0.9, 0.0, np.nan]),
+    }
+    picture = rng.integers(0, 256, (480, 640), dtype=np.uint8)
+    return View(stations, camera, T0 + 10**9, 640, 480, preview_jpeg(picture), "", tags)
+
+
 def made_up_inputs(unit="m", seed=7):
     """The whole made-up run for a site whose grid is in `unit`."""
     rng = np.random.default_rng(seed)
     stations = stations_table(rng)
+    views = (
+        view(),
+        view((106.25, 106.75), "stickcam", 1),
+        View((113.75,), "bench", T0, why="it is not there"),
+    )
     frames, detections, residuals, edge = log_tables(rng)
     statics = {
         key: np.array(values, object if isinstance(values[0], str) else float)
@@ -291,6 +330,11 @@ def made_up_inputs(unit="m", seed=7):
             "checks": checks_table(rng),
         },
         detections=detections,
+        moments=(
+            Moment(106.25, 0.071, 0.0108, "FAIL", T0 + 10**9, 200, 240),
+            Moment(106.75, 0.064, 0.0108, "FAIL", T0 + 2 * 10**9, 130, 240),
+        ),
+        views=views,
         log_facts=copy.deepcopy(LOG_FACTS),
         detection=copy.deepcopy(DETECTION),
         solution=copy.deepcopy(SOLUTION),

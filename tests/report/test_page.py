@@ -49,7 +49,9 @@ def test_a_browser_grade_parser_finds_no_fault(page):
 
 
 def test_nothing_on_the_page_points_outside(page, read):
-    assert all(ref.startswith(("#", "data:image/png;base64,")) for ref in read.references), read.references
+    assert all(
+        ref.startswith(("#", "data:image/png;base64,", "data:image/jpeg;base64,")) for ref in read.references
+    ), read.references
     assert re.findall(r"url\((?!#)", page.html) == []
     assert "@import" not in page.html
     assert not [
@@ -73,7 +75,7 @@ def test_every_label_names_an_element_that_is_there(read):
 def test_every_figure_is_described_and_says_what_good_looks_like(page, read):
     pictures = [found for tag, found in read.tags if tag == "svg"]
     drawn = [name for name, about in page.content["figures"].items() if not about["why"]]
-    assert len(pictures) == len(drawn) == 9
+    assert len(pictures) == len(drawn) == 14
     assert all(found.get("role") == "img" and found.get("aria-labelledby") for found in pictures)
     for name in drawn:
         about = page.content["figures"][name]
@@ -264,6 +266,8 @@ def test_a_run_without_anything_says_what_is_missing_and_why():
         solution={},
         log_facts={},
         alignment=None,
+        moments=(),
+        views=(),
         missing={"stations": "stations.parquet is missing or damaged", "survey.json": "it was never written"},
     )
     page = render(empty)
