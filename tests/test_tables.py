@@ -113,6 +113,43 @@ def test_portions_give_the_rows_of_one_piece(tmp_path):
         np.testing.assert_array_equal(found[key], values)
 
 
+def test_rows_of_some_instants_are_those_of_the_whole_table(tmp_path, monkeypatch):
+    monkeypatch.setattr(tables, "ROW_GROUP", 100)
+    columns = random_columns("residuals", 5000)
+    rng = np.random.default_rng(0)
+    columns["time_ns"] = np.sort(rng.integers(0, 900, 5000)) * 10**9
+    tables.write_table(tmp_path / "t.parquet", "residuals", columns)
+    at_ns = np.array([7, 450, 451, 899, 10_000]) * 10**9
+    found = tables.read_table(tmp_path / "t.parquet", "residuals", ["corner", "camera", "weight"], at_ns)
+    wanted = np.isin(columns["time_ns"], at_ns)
+    assert sorted(found) == ["camera", "corner", "weight"] and 10 < wanted.sum() < 50
+    for name, values in found.items():
+        np.testing.assert_array_equal(values, columns[name][wanted])
+
+
+def test_row_groups_of_other_times_are_not_read(tmp_path, monkeypatch):
+    import pyarrow.parquet as pq
+
+    monkeypatch.setattr(tables, "ROW_GROUP", 100)
+    columns = random_columns("residuals", 5000)
+    columns["time_ns"] = np.arange(5000) * 10**9
+    tables.write_table(tmp_path / "t.parquet", "residuals", columns)
+    read, real = [], pq.ParquetFile.read_row_group
+    monkeypatch.setattr(
+        pq.ParquetFile, "read_row_group", lambda self, i, **k: (read.append(i), real(self, i, **k))[1]
+    )
+    found = tables.read_table(tmp_path / "t.parquet", "residuals", ["corner"], np.array([250, 4900]) * 10**9)
+    assert read == [2, 49] and len(found["corner"]) == 2
+
+
+def test_instants_that_are_not_there_give_no_rows(tmp_path):
+    columns = random_columns("residuals", 10)
+    tables.write_table(tmp_path / "t.parquet", "residuals", columns)
+    for at_ns in ([], [-5]):
+        found = tables.read_table(tmp_path / "t.parquet", "residuals", None, np.array(at_ns, np.int64))
+        assert {len(values) for values in found.values()} == {0} and len(found) == 10
+
+
 @pytest.mark.parametrize(
     "change, error, said",
     [

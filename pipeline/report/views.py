@@ -130,7 +130,7 @@ def tags_table(view: View, words: Words) -> dict[str, Any]:
 def _adjusted(view: View) -> np.ndarray:
     """(n,) tags that have predicted corners."""
     predicted = view.tags.get("predicted", np.zeros((0, 4, 2)))
-    return np.isfinite(predicted).reshape(len(predicted), 8).all(axis=1)
+    return np.asarray(np.isfinite(predicted).reshape(len(predicted), 8).all(axis=1))
 
 
 def enlargement(view: View) -> int:

@@ -165,7 +165,7 @@ def _with_pictures(
         with read_log(job.log, contents) as reader:
             done = {}
             for key, shot in wanted.items():
-                done[key] = replace(views[key], why="its picture is not in the log any more")
+                done[key] = replace(views[key], why="its picture cannot be read from the log")
                 topics = {shot.camera: facts[shot.camera]["topic"]}
                 for frame in reader.frames(topics, shot.log_time_ns, shot.log_time_ns + 1):
                     if frame.time_ns == shot.time_ns:
