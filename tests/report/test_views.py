@@ -136,7 +136,7 @@ def test_labels_hide_neither_tags_nor_each_other(count, step):
 
 
 def test_one_frame_of_two_stations_names_both():
-    content, pictures, about = evidence_of(view((106.25, 106.75)))
+    _, pictures, about = evidence_of(view((106.25, 106.75)))
     assert about["view_0"]["title"] == "Station 106.25 m, 106.75 m, camera bench at 14:13:21.00 UTC"
     assert list(pictures) == ["view_0"]
 
