@@ -20,7 +20,7 @@ AS_BUILT = "#0b62a4"
 RIBBON = "#9cc3e0"
 BAND = "#e4e8ec"
 CHECK = "#9a3f00"
-ACCENTS = ("#0b62a4", "#b85300", "#5c6670", "#6aa6d6", "#e09a4b", "#2f3b46", "#9fb8cc")
+ACCENTS = ("#0b62a4", "#b85300", "#5c6670", "#3f86bd", "#a8631c", "#2f3b46", "#6d8399")
 """For parts of a whole (sources, reasons), in the order they are drawn; each is named beside its mark too."""
 
 # Low (over-dug) is blue, high (under-dug) is orange; lightness falls to both sides alike, so the scale
@@ -79,8 +79,25 @@ CONTRASTS = (
 )
 """Name, foreground, background of every pair that carries text; WCAG 2 asks for 4.5."""
 
-MARKS = (("as-built line", AS_BUILT, PAPER), ("check shot", CHECK, PAPER), ("design line", DESIGN, BAND))
+MARKS = (
+    *(
+        (f"as-built line on {n}", AS_BUILT, c)
+        for n, c in (("paper", PAPER), ("band", BAND), ("ribbon", RIBBON))
+    ),
+    *((f"check shot on {n}", CHECK, c) for n, c in (("paper", PAPER), ("band", BAND), ("ribbon", RIBBON))),
+    *((f"design line on {n}", DESIGN, c) for n, c in (("paper", PAPER), ("band", BAND), ("ribbon", RIBBON))),
+    *((f"thin line on {n}", MUTED, c) for n, c in (("paper", PAPER), ("band", BAND), ("ribbon", RIBBON))),
+    *((f"accent {i}", colour, PAPER) for i, colour in enumerate(ACCENTS)),
+    ("tags per frame where the edge was bridged", AS_BUILT, PASSED_OVER),
+    ("hatching", INK, RIBBON),
+    ("detected tag on its dark line", DETECTED, INK),
+    ("predicted corner on its dark line", PREDICTED, INK),
+    ("dark line on a bright picture", INK, PAPER),
+)
 """Pairs that carry meaning without text; WCAG 2 asks for 3."""
+
+GROUNDS = (PAPER, WASH, BAND, RIBBON, PASSED_OVER, NEVER_TOUCHED, RULE)
+"""Areas and rules that something else outlines or names: never the only carrier of a meaning."""
 
 
 def verdict_style(word: str) -> VerdictStyle:

@@ -105,7 +105,6 @@ def _deviations(
             *decimated(units.to_length(fine[0]), units.to_deviation(fine[1])),
             color=palette.MUTED,
             lw=0.5,
-            alpha=0.75,
             label="centre cells",
         )
     ax.fill_between(

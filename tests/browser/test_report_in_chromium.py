@@ -6,6 +6,7 @@ import struct
 
 import pytest
 
+from tests.browser.printed import pages_of
 from tests.report.pages import PageReader, as_float, at_path
 
 pytestmark = pytest.mark.browser
@@ -88,15 +89,68 @@ def test_the_page_can_be_photographed(browser, page_file, tmp_path):
     assert picture.stat().st_size > 100_000  # an empty page has some 10 kB
 
 
-def test_the_page_prints_on_a4(browser, page_file, tmp_path):
-    file = tmp_path / "page.pdf"
+@pytest.fixture(scope="module")
+def printed(browser, page_file, tmp_path_factory):
+    """The PDF of the page, as bytes."""
+    file = tmp_path_factory.mktemp("printed") / "page.pdf"
     browser(page_file, "--no-pdf-header-footer", f"--print-to-pdf={file}")
-    data = file.read_bytes()
+    return file.read_bytes()
+
+
+def test_the_page_prints_on_a4(printed):
     boxes = {
-        tuple(round(float(x)) for x in box.split()) for box in re.findall(rb"/MediaBox \[([^\]]+)\]", data)
+        tuple(round(float(x)) for x in box.split()) for box in re.findall(rb"/MediaBox \[([^\]]+)\]", printed)
     }
     assert boxes <= {(0, 0, 595, 842), (0, 0, 596, 842), (0, 0, 594, 842)}
-    assert 4 <= len(re.findall(rb"/Type /Page\b(?!s)", data)) <= 16
+    assert 4 <= len(re.findall(rb"/Type /Page\b(?!s)", printed)) <= 16
+
+
+def test_heads_of_tables_stand_on_every_page_they_run_over(page, printed):
+    """Elevations of stations tell which pages the table is on: no other table has them to the millimetre."""
+    rows = page.content["stations"]["rows"]
+    heights = [f"{row['h']:.3f}{row['design_h']:.3f}" for row in rows if row["h"] is not None]
+    pages = [text for text, _ in pages_of(printed)]
+    with_rows = [text for text in pages if sum(height in text for height in heights) >= 2]
+    assert len(with_rows) >= 2, "the table fits on one page and shows nothing"
+    for text in with_rows:
+        head = text.index("Verdict")
+        assert text[head:].startswith("VerdictDeviationmmUmmAs‑builtmDesignm")
+        first = min(text.index(height) for height in heights if height in text)
+        assert head < first
+    assert sum(height in text for text in pages for height in heights) == len(heights)
+
+
+def test_no_picture_is_cut_between_two_pages(page, printed):
+    """A raster picture that is cut would be drawn on both."""
+    drawn = [name for _, images in pages_of(printed) for name in images]
+    assert len(set(drawn)) == len(drawn)
+    assert len(drawn) >= len(re.findall("<image ", page.html))
+
+
+def test_every_figure_fits_on_a_page_and_asks_to_stay_whole(browser, page, tmp_path):
+    """A4 less its margins, 184 x 268 mm; the rules of print hold on a screen of that width."""
+    html = page.html.replace("@media print", "@media all")
+    html = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", html)
+    ask = (
+        "<script>const told = [...document.querySelectorAll('figure')].map(f => {"
+        "const style = getComputedStyle(f), box = f.getBoundingClientRect();"
+        "return [Math.round(box.width), Math.round(box.height), style.breakInside]});"
+        "const heads = [...document.querySelectorAll('thead')].map(h => getComputedStyle(h).display);"
+        "document.body.innerHTML = '<pre>' + JSON.stringify({told, heads}) + '</pre>';</script>"
+    )
+    (tmp_path / "inner.html").write_text(html.replace("</body>", f"{ask}</body>"), encoding="utf-8")
+    frame = tmp_path / "frame.html"
+    frame.write_text(
+        "<!DOCTYPE html><body style='margin:0'><iframe id=f src=inner.html style='border:0;width:184mm;height:9000px'>"
+        "</iframe><script>f.onload = () => {document.body.textContent = f.contentDocument.body.textContent}</script>"
+    )
+    dom = browser(frame, "--allow-file-access-from-files", "--window-size=1400,9000", "--dump-dom")
+    found = json.loads(re.search(r"<body[^>]*>(\{.*\})\s*</body>", dom, re.S).group(1))
+    assert len(found["told"]) == len(page.content["figures"])
+    millimetre = 96 / 25.4
+    for width, height, inside in found["told"]:
+        assert inside == "avoid" and width <= 184 * millimetre + 1 and height <= 268 * millimetre
+    assert set(found["heads"]) == {"table-header-group"}
 
 
 def test_scripts_are_not_needed(page):

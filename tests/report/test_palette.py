@@ -1,5 +1,8 @@
 """Every pair of colours can be read, and the scale of deviations survives colour blindness and grey printing."""
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -44,9 +47,51 @@ def test_contrast_is_that_of_the_standard():
 def test_the_style_sheet_uses_no_colour_that_is_not_tested():
     tested = {colour for _, *pair in palette.CONTRASTS for colour in pair}
     css = (template_folder() / "style.css").read_text(encoding="utf-8")
-    used = {word.lower() for word in __import__("re").findall(r"#[0-9a-fA-F]{6}\b", css)}
+    used = {word.lower() for word in re.findall(r"#[0-9a-fA-F]{6}\b", css)}
     lines = {palette.RULE, "#e1e5e9"}  # thin rules between cells carry no meaning
     assert used <= tested | lines
+
+
+def colours_of(value):
+    """Every colour in a constant of the palette."""
+    if isinstance(value, str):
+        return {value} if value.startswith("#") else set()
+    if isinstance(value, palette.VerdictStyle):
+        return {value.ink}
+    if isinstance(value, dict):
+        return set().union(*map(colours_of, value.values()))
+    return set().union(*map(colours_of, value)) if isinstance(value, tuple) else set()
+
+
+def test_no_figure_uses_a_colour_whose_contrast_is_not_tested():
+    """What figures name of the palette is in a tested pair, or only a ground, or the scale of deviations."""
+    tested = {colour for _, *pair in (*palette.CONTRASTS, *palette.MARKS) for colour in pair}
+    allowed = tested | set(palette.GROUNDS) | set(palette.LOW_TO_HIGH)
+    sources = sorted((Path(palette.__file__).parent).glob("*.py"))
+    named = {name for file in sources for name in re.findall(r"palette\.([A-Z_]+)\b", file.read_text())}
+    assert {"AS_BUILT", "CHECK", "ACCENTS", "PREDICTED"} <= named
+    for name in sorted(named):
+        assert colours_of(getattr(palette, name)) <= allowed, name
+
+
+def test_no_figure_writes_a_colour_of_its_own():
+    """But for the grid behind everything, which carries nothing."""
+    found = {
+        (file.name, colour)
+        for file in Path(palette.__file__).parent.glob("*.py")
+        if file.name != "palette.py"
+        for colour in re.findall(r"#[0-9a-fA-F]{6}\b", file.read_text())
+    }
+    assert found == {("drawing.py", "#e1e5e9")}
+
+
+def test_the_style_sheet_and_the_palette_agree():
+    """A verdict has one colour on the page and in figures."""
+    css = (template_folder() / "style.css").read_text(encoding="utf-8")
+    for style in (*palette.VERDICTS.values(), palette.UNKNOWN_VERDICT):
+        assert f"--{style.slug}: {style.ink};" in css
+    for name, colour in (("ink", palette.INK), ("muted", palette.MUTED), ("link", palette.LINK)):
+        assert f"--{name}: {colour};" in css
 
 
 @pytest.mark.parametrize("eye", BLINDNESS)
