@@ -73,16 +73,17 @@ def _about(view: View, units: Units, words: Words) -> dict[str, str]:
     good = words("figures.view.good")
     if view.jpeg and _adjusted(view).any():
         good += " " + words("evidence.strokes", n=enlargement(view))
+    described = words(
+        "figures.view.description",
+        accepted=int((status == ACCEPTED).sum()),
+        rejected=len(rejected),
+        listed=", ".join(rejected) or words("evidence.nothing"),
+        **places,
+    )
     return {
         "title": words("figures.view.title", **places),
         "good": good,
-        "description": words(
-            "figures.view.description",
-            accepted=int((status == ACCEPTED).sum()),
-            rejected=len(rejected),
-            listed=", ".join(rejected) or words("evidence.nothing"),
-            **places,
-        ),
+        "description": "" if view.why else described,
         "why": words("page.not_available", why=view.why) if view.why else "",
     }
 

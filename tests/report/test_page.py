@@ -1,6 +1,7 @@
 """The page is sound HTML, asks for nothing, hides nothing, and its numbers are those of report.json and the tables."""
 
 import dataclasses
+import html
 import json
 import re
 
@@ -299,3 +300,78 @@ def test_no_sentence_on_the_page_keeps_a_place_unfilled(page):
     text = NO_MATCH_SVG.sub("", page.html)
     text = re.sub(r"<style>.*?</style>", "", text, flags=re.S)
     assert re.findall(r"\{\w+\}", text) == []
+
+
+def said(page):
+    """Every sentence of report.json that stands on the page outside its tables."""
+    content = page.content
+    attention = content["attention"]
+    sentences = [item["sentence"] for item in attention["items"] + attention["more"]]
+    sentences += [entry["note"] for entry in content["summary"]] + content["evidence"]["moments"]
+    sentences += [figure["description"] for figure in content["figures"].values()]
+    return [sentence for sentence in sentences if sentence]
+
+
+def test_every_sentence_of_report_json_stands_on_the_page(page):
+    text = html.unescape(re.sub(r"<style>.*?</style>", "", page.html, flags=re.S))
+    for sentence in said(page):
+        assert sentence in text, sentence
+
+
+def test_numbers_in_sentences_are_those_of_the_tables(page):
+    """Counted and measured here from the inputs, not taken from what the page was made of."""
+    inputs = made_up_inputs()
+    stations, cells, checks = (inputs.tables[name] for name in ("stations", "as_built", "checks"))
+    verdict, deviation = stations["verdict"], 1000 * stations["deviation"]
+    worst = int(np.nanargmax(np.abs(deviation)))
+    dug = np.isfinite(deviation)
+    own, common = (1000 * np.nanmedian(stations[f"sigma_{part}"]) for part in ("own", "common"))
+    on = np.isfinite(cells["deviation"])
+    everything = " ".join(said(page)).replace("\u2212", "-")
+    for expected in (
+        f"Out of tolerance: {np.sum(verdict == 'FAIL')} of {len(verdict)} stations",
+        f"the worst is {stations['station'][worst]:.2f} m with {deviation[worst]:+.0f} mm ± "
+        f"{1000 * stations['expanded_uncertainty'][worst]:.0f} mm, high",
+        f"Cannot be decided: {np.sum(verdict == 'CANNOT TELL')} of {len(verdict)}",
+        f"Not reached by the cutting edge: {np.sum(verdict == 'NOT REACHED')} of {len(verdict)}",
+        f"of {dug.sum()} dug, {len(verdict)} in the design",
+        f"lowest {deviation[dug].min():+.0f} mm, highest {deviation[dug].max():+.0f} mm",
+        f"Histogram of the deviation, as-built minus design, of {on.sum()} cut cells",
+        "with the tolerance from -50 mm to +30 mm",
+        f"of {np.isfinite(checks['z']).sum()} compared check shots",
+        f"its own part (median {own:.3g} mm), its common part (median {common:.3g} mm)",
+        "Beyond 20 mm no deviation could pass",  # (30 + 50) / 2 over k = 2
+        "(1 gaps, 12.2 s in all)",
+        "(1 spells, 20.0 s in all)",
+        "with 2 accepted tags outlined",
+    ):
+        assert expected in everything, expected
+
+
+@pytest.mark.parametrize("unit", ["international_foot", "us_survey_foot"])
+def test_new_figures_of_a_site_in_feet_speak_in_feet(unit):
+    feet = {"international_foot": 1 / 0.3048, "us_survey_foot": 3937 / 1200}[unit]
+    content = render(made_up_inputs(unit)).content
+    name = {"international_foot": "ft", "us_survey_foot": "US ft"}[unit]
+    assert (
+        f"Station {106.25 * feet:.2f} {name}, FAIL, deviation +{0.071 * feet:.3f} {name}"
+        in (content["evidence"]["moments"][0])
+    )
+    assert content["figures"]["view_0"]["title"].startswith(f"Station {106.25 * feet:.2f} {name}")
+    assert (
+        f"Beyond {0.020 * feet:.3f} {name} no deviation" in content["figures"]["uncertainty"]["description"]
+    )
+    assert f"[{name}]" in content["cell_deviations"]["columns"][0]["label"]
+
+
+def test_every_table_of_the_new_sections_is_held_against_report_json(read):
+    """Those that the test of all tables must have met."""
+    assert {
+        "check_residuals",
+        "cell_deviations",
+        "coverage.idle",
+        "coverage.gaps",
+        "evidence.views.0.tags",
+        "evidence.views.1.tags",
+    } <= set(read.tables)
+    assert {"coverage.idle_total", "coverage.idle_count"} <= set(read.numbers)
