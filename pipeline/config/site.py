@@ -19,6 +19,7 @@ from pipeline.config.quantities import (
     SigmaTriple,
     Triple,
 )
+from pipeline.config.utility import MAX_UTILITIES, Utility
 
 FORMAT = "gradetrace/site/1"
 MAX_FROM_ORIGIN_M = 20_000.0
@@ -341,6 +342,8 @@ class Site(Section):
     ground: Ground | None = None
     tolerance: Tolerance
     checks: Checks | None = None
+    utilities: Annotated[dict[Name, Utility], Field(max_length=MAX_UTILITIES)] = {}
+    """Buried lines that the cutting edge must keep away from."""
     detection: DetectionSettings = DetectionSettings()
     estimation: EstimationSettings = EstimationSettings()
     survey: SurveySettings = SurveySettings()
@@ -376,6 +379,21 @@ class Site(Section):
                 raise ValueError(
                     f"benchmarks.{name} lies {away_m / 1000:,.0f} km from grid.origin "
                     f"(limit {MAX_FROM_ORIGIN_M / 1000:.0f} km): check the order "
+                    "easting, northing, elevation, the unit, and the origin"
+                )
+        return self
+
+    @model_validator(mode="after")
+    def _utilities_near(self) -> Site:
+        for name, utility in self.utilities.items():
+            if not utility.points:
+                continue
+            away_m = np.linalg.norm(self.grid.to_world(np.array(utility.points)), axis=1)
+            furthest = int(np.argmax(away_m))
+            if away_m[furthest] > MAX_FROM_ORIGIN_M:
+                raise ValueError(
+                    f"utilities.{name}.points: point {furthest + 1} lies {away_m[furthest] / 1000:,.0f} km from "
+                    f"grid.origin (limit {MAX_FROM_ORIGIN_M / 1000:.0f} km): check the order "
                     "easting, northing, elevation, the unit, and the origin"
                 )
         return self
