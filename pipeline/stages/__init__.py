@@ -101,7 +101,7 @@ def _tracking(job: Job) -> Settings:
 
 
 def _surveying(job: Job) -> Settings:
-    wanted = {"grid", "alignment", "design", "ground", "tolerance", "checks", "survey"}
+    wanted = {"grid", "alignment", "design", "ground", "tolerance", "checks", "utilities", "survey"}
     return {
         "width_m": job.machine.cutting_edge.width_m,
         "time_zone": job.site.report.time_zone,
@@ -133,7 +133,7 @@ class Stage:
     needs: tuple[str, ...]
     """Stages whose outputs it reads."""
     reads: tuple[str, ...]
-    """`log`, and which of the files that site.toml names: `design`, `ground`, `checks`."""
+    """`log`, and which of the files that site.toml names: `design`, `ground`, `checks`, `utilities` (all of them)."""
     tables: tuple[str, ...]
     """Tables it writes."""
     settings: Callable[[Job], Settings]
@@ -158,8 +158,8 @@ STAGES = (
         3,
         "as-built against design",
         ("estimate", "track"),
-        ("design", "ground", "checks"),
-        ("as_built", "stations", "sides", "volumes", "checks"),
+        ("design", "ground", "checks", "utilities"),
+        ("as_built", "stations", "sides", "volumes", "checks", "utilities"),
         _surveying,
     ),
     Stage(
@@ -167,7 +167,7 @@ STAGES = (
         4,
         "writing the report",
         ("ingest", "detect", "estimate", "track", "survey"),
-        ("log", "design", "checks"),
+        ("log", "design", "checks", "utilities"),
         (),
         _reporting,
     ),

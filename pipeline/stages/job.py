@@ -79,7 +79,7 @@ class Job:
     machine_source: Source
     site_source: Source
     files: dict[str, NamedFile]
-    """`design`, and `checks` if the site has check shots."""
+    """`design`, `checks` if the site has check shots, `utilities.<name>` for each that is read from a file."""
     workers: int = 1
     strict: bool = False
     stage: Stage | None = None
@@ -267,6 +267,7 @@ def named_files(site: Site, source: Source, folder: RunFolder) -> dict[str, Name
     wanted = {"design": site.design.file} | ({"checks": site.checks.file} if site.checks else {})
     if site.ground is not None and site.ground.file is not None:
         wanted["ground"] = site.ground.file
+    wanted |= {f"utilities.{name}": utility.file for name, utility in site.utilities.items() if utility.file}
     found = {}
     for key, name in wanted.items():
         path = resolve_named_file(source.folder, name, f"{source.name}: {key}.file")

@@ -52,8 +52,8 @@ def plan(job: Job, stage: Stage) -> Plan:
     for kind in stage.reads:
         if kind == "log":
             inputs["log"] = job.log_sha256
-        elif kind in job.files:
-            inputs[kind] = job.files[kind].sha256
+        else:  # of some kinds there are several: utilities.<name>
+            inputs |= {key: file.sha256 for key, file in job.files.items() if key.partition(".")[0] == kind}
     for needed in stage.needs:
         manifest = job.folder.manifest(needed)
         if manifest is not None:

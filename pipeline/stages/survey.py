@@ -1,4 +1,4 @@
-"""survey: the cutting edge -> as-built surface, verdict per station, total-station checks.
+"""survey: the cutting edge -> as-built surface, verdict per station, total-station checks, buried utilities.
 
 `survey.json`::
 
@@ -58,6 +58,7 @@
             or null,
         }
         or null,
+        "utilities": {"reach", "lines": [see `surface.utilities.facts_of`]} or null,
     }
 
 The statistics that stand in `checks` itself are those of the floor. All lengths are metres; what there is nothing of
@@ -94,6 +95,7 @@ from pipeline.surface.design import TinDesign, floor_sentence, read_design
 from pipeline.surface.ground import read_ground
 from pipeline.surface.sides import sides
 from pipeline.surface.sweep import path_along
+from pipeline.surface.utilities import REACH_M, VERDICTS, facts_of, find_approaches, read_utilities
 from pipeline.surface.volumes import Volume, volumes
 from pipeline.surface.wanted_shots import wanted_shots
 from pipeline.tables import NULL_INT, empty_columns
@@ -104,9 +106,9 @@ SIGMA_SHOT_M = 0.002
 
 
 def run(job: Job, progress: Progress) -> Counts:
-    """Write `as_built`, `stations`, `sides`, `volumes`, `checks` and `survey.json`.
+    """Write `as_built`, `stations`, `sides`, `volumes`, `checks`, `utilities` and `survey.json`.
 
-    Raises SurfaceError for a design, an alignment or check shots that cannot be used.
+    Raises SurfaceError for a design, an alignment, check shots or utilities that cannot be used.
     """
     site = job.site
     scale = site.grid.metres_per_unit
@@ -116,6 +118,7 @@ def run(job: Job, progress: Progress) -> Counts:
     ground_file = job.files.get("ground")
     ground = read_ground(ground_file.path if ground_file else None, site, alignment)
     shots = check_shots.shots_of(job, design, alignment)
+    buried = read_utilities(site, {key: file.path for key, file in job.files.items()})
     progress.advance()
 
     edge = cutting_edge_from_columns(job.read_table("cutting_edge", EDGE_COLUMNS))
@@ -166,6 +169,8 @@ def run(job: Job, progress: Progress) -> Counts:
             progress.warn(
                 f"{job.files['checks'].name} holds no check shots: there is no independent check of this report"
             )
+    found = find_approaches(edge, buried)
+    job.write_table("utilities", table.columns_of_utilities(found, alignment))
     job.write_json(
         "survey.json",
         {
@@ -205,6 +210,9 @@ def run(job: Job, progress: Progress) -> Counts:
             },
             "surface": _surface_facts(built),
             "checks": checks,
+            "utilities": {"reach": REACH_M, "lines": [facts_of(finding, alignment) for finding in found]}
+            if found
+            else None,
         },
     )
     progress.advance()
@@ -230,6 +238,9 @@ def run(job: Job, progress: Progress) -> Counts:
     if checks is not None:
         counted["check shots"] = checks["shots"]
         counted["of these compared"] = sum(kind["n"] for kind in checks["kinds"].values())
+    if found:
+        words = [finding.verdict for finding in found]
+        counted["utilities"] = {word: words.count(word) for word in VERDICTS if word in words}
     return counted
 
 

@@ -24,7 +24,7 @@ PAUSE_S = 2.0
 """Two approaches are one where the edge was out of the clearance for less than this in between."""
 KEPT = 50
 """Approaches kept of each line, the lowest bounds first; all are counted."""
-_SPREAD = 3.0
+_SPREAD = 2.5
 """No bound lies more than this many of the largest sigma below its estimate: 2.448 of it at most."""
 
 Motion = tuple[np.ndarray, np.ndarray, np.ndarray, int]
@@ -120,7 +120,7 @@ def approaches(
         One per line.
     """
     settings = settings or SweepSettings()
-    if not len(edge):
+    if not len(edge) or not lines:
         return [_nothing() for _ in lines]
     p = np.ascontiguousarray(edge.p_grid)
     bend_ns = round(settings.interpolation_s * 1e9)
@@ -128,7 +128,19 @@ def approaches(
         edge.time_ns, p, edge.seen, edge.cov, round(settings.max_step_s * 1e9), bend_ns
     )
     motion = (edge.time_ns, p, swept, bend_ns)
-    return [_of_line(edge, motion, travel, spread, line, reach_m) for line in lines]
+    box = np.array([(p[..., axis].min(), p[..., axis].max()) for axis in range(3)])
+    return [
+        _of_line(
+            edge,
+            motion,
+            travel,
+            spread,
+            _segments(edge, box, float(spread.max()), line, reach_m),
+            line,
+            reach_m,
+        )
+        for line in lines
+    ]
 
 
 def _nothing() -> Approaches:
@@ -138,12 +150,18 @@ def _nothing() -> Approaches:
 
 
 def _of_line(
-    edge: CuttingEdge, motion: Motion, travel: np.ndarray, spread: np.ndarray, line: Line, reach_m: float
+    edge: CuttingEdge,
+    motion: Motion,
+    travel: np.ndarray,
+    spread: np.ndarray,
+    segments: np.ndarray,
+    line: Line,
+    reach_m: float,
 ) -> Approaches:
     h, v = line.sigma_horizontal**2, line.sigma_vertical**2
     times, rows, counts, unseen = _follow(
-        *motion, edge.seen, travel, spread, edge.cov, edge.common, _segments(edge, line, reach_m),
-        np.array([h, 0.0, 0.0, h, 0.0, v]), quantiles(), line.clearance, reach_m, round(PAUSE_S * 1e9), KEPT,
+        *motion, edge.seen, travel, spread, edge.cov, edge.common, segments, np.array([h, 0.0, 0.0, h, 0.0, v]),
+        quantiles(), line.clearance, reach_m, round(PAUSE_S * 1e9), KEPT,
     )  # fmt: skip
     order = 1 + np.argsort(rows[1:, COLUMNS - 1], kind="stable")
     return Approaches(
@@ -167,17 +185,17 @@ def _instants(times: np.ndarray, rows: np.ndarray) -> Instants:
     )
 
 
-def _segments(edge: CuttingEdge, line: Line, reach_m: float) -> np.ndarray:
+def _segments(edge: CuttingEdge, box: np.ndarray, spread: float, line: Line, reach_m: float) -> np.ndarray:
     """Segments (m, 11) that can be the nearest one or within reach: of a town's sewers those beside the job."""
-    p = edge.p_grid
-    low, high = p.min(axis=(0, 1)), p.max(axis=(0, 1))
-    apart = np.maximum(low - np.maximum(line.start, line.end), np.minimum(line.start, line.end) - high)
+    apart = np.maximum(
+        box[:, 0] - np.maximum(line.start, line.end), np.minimum(line.start, line.end) - box[:, 1]
+    )
     at_least = np.linalg.norm(np.maximum(apart, 0.0), axis=1) - line.radius
     # The edge's way as a whole is no further from a line than one seen place of it is from one point of that line.
-    one = p[int(np.argmax(edge.seen)), 1]
+    one = edge.p_grid[int(np.argmax(edge.seen)), 1]
     at_most = float(np.min(np.linalg.norm(line.start - one, axis=1) - line.radius))
-    noise = np.sqrt(3 * edge.cov.max(initial=0.0)) + line.sigma_horizontal * np.sqrt(2) + line.sigma_vertical
-    keep = at_least <= max(at_most, reach_m, line.clearance + _SPREAD * float(noise))
+    wide = _SPREAD * float(np.hypot(spread, max(line.sigma_horizontal, line.sigma_vertical)))
+    keep = at_least <= max(at_most, reach_m, line.clearance + wide)
     start, end, radius = line.start[keep], line.end[keep], line.radius[keep]
     half = 0.5 * np.linalg.norm(end - start, axis=1)
     return np.column_stack([start, end, 0.5 * (start + end), half, radius])
@@ -207,7 +225,7 @@ def _follow(
     span, event, row = np.zeros(3, np.int64), np.empty(COLUMNS), np.empty(COLUMNS)
     going = blind = blind_near = False
     blind_from, best, event_low, event_bound = time_ns[0], np.inf, np.inf, np.inf
-    of_line = np.sqrt(variance[0] + variance[3] + variance[5])
+    of_line = max(variance[0], variance[5])
     # The distance at the epoch before, inf if nobody asked; and what the distance has not gone below since.
     before, at_least = np.inf, -np.inf
     for k in range(n + 1):
@@ -216,12 +234,15 @@ def _follow(
             going, event_low = False, np.inf
         if k == n:
             break
-        wide = _SPREAD * (spread[k] + of_line)
+        wide = spread[k]
         if k > 0:
             at_least -= travel[k - 1]
-            wide = max(wide, _SPREAD * (spread[k - 1] + of_line))
-        here = np.inf
-        if at_least < max(reach, clearance + wide, best):
+            wide = max(wide, spread[k - 1])
+        wide = _SPREAD * np.sqrt(wide * wide + of_line)
+        here, wanted = np.inf, max(clearance + wide, best)
+        if not swept[k] or (k > 0 and not swept[k - 1]):  # unseen stretches begin or end here, or go on
+            wanted = max(wanted, reach)
+        if at_least < wanted:
             if before == np.inf and k > 0 and swept[k - 1]:
                 before = nearest(p[k - 1], segments, at)
             here = nearest(p[k], segments, at)
@@ -243,6 +264,9 @@ def _follow(
                         continue
                     edge[:] = p[k]
                 if low >= max(best, clearance + wide):
+                    continue
+                if going and event_low <= low < clearance and low - wide >= event_bound:
+                    span[1] = now  # it goes on, and is no graver for this instant
                     continue
                 low = nearest(edge, segments, at)
                 measured(edge, low, at, epoch, u, cov, common, segments, variance, table, row)

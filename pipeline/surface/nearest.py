@@ -132,7 +132,8 @@ def nearest(edge, segments, at):  # pragma: no cover - compiled
         square = 0.0
         for a in range(3):
             square += (edge[1, a] - segments[j, MIDDLE + a]) ** 2
-        if np.sqrt(square) - segments[j, HALF] - reach - segments[j, RADIUS] >= best:
+        limit = best + reach + segments[j, HALF] + segments[j, RADIUS]
+        if square >= limit * limit:
             continue
         for i in range(2):
             distance, s, t = between(edge[i], edge[i + 1], segments[j, :3], segments[j, 3:6])

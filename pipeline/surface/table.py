@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.surface.alignment import Alignment
+from pipeline.surface.approach import Instants
 from pipeline.surface.as_built import STATE_NAMES, AsBuilt
 from pipeline.surface.checks import Comparison
 from pipeline.surface.decision import SideVerdicts, Stations
 from pipeline.surface.shots import Shots
 from pipeline.surface.sides import SIDES, Sides
+from pipeline.surface.utilities import Finding, verdict_of
 from pipeline.surface.volumes import Volumes
 
 Columns = dict[str, np.ndarray]
@@ -94,4 +97,57 @@ def columns_of_checks(shots: Shots, comparison: Comparison) -> Columns:
             for name in (*whole, "sigma_common", "sigma", "sigma_ts", "z", "result")
         },
         **{f"sigma_{axis}": np.where(edge, np.sqrt(variance), np.nan) for axis, variance in plan.items()},
+    }
+
+
+def columns_of_utilities(findings: list[Finding], alignment: Alignment) -> Columns:
+    """Columns of the ``utilities`` table: of each utility the nearest instant of the log, then its approaches."""
+    rows: list[dict[str, object]] = []
+    for finding in findings:
+        near = finding.approaches
+        events = [_instant(near.events, i, finding, alignment) for i in range(len(near.start_ns))]
+        for row, start, end in zip(events, near.start_ns, near.end_ns):
+            row |= {"start_ns": start, "end_ns": end}
+        if near.closest is not None:
+            closest = _instant(near.closest, 0, finding, alignment)
+            # As a rule it is the nearest instant of an approach that is listed anyway.
+            same = next((row for row in events if row["time_ns"] == closest["time_ns"]), None)
+            if same is None:
+                rows.append(closest)
+            else:
+                events.remove(same)
+                rows.append(same)
+            rows[-1]["nearest"] = True
+        rows += events
+    return {name: np.array([row[name] for row in rows], kind) for name, kind in _UTILITY_COLUMNS.items()}
+
+
+_UTILITY_COLUMNS = {
+    "utility": object, "kind": object, "nearest": bool, "verdict": object, "start_ns": np.int64, "end_ns": np.int64,
+    "time_ns": np.int64, "station": float, "offset": float, "e": float, "n": float, "h": float, "axis_e": float,
+    "axis_n": float, "axis_h": float, "distance": float, "bound": float, "sigma_own": float, "sigma_common": float,
+    "sigma_line": float,
+}  # fmt: skip
+
+
+def _instant(found: Instants, i: int, finding: Finding, alignment: Alignment) -> dict[str, object]:
+    station, offset = alignment.station_offset(found.edge[i : i + 1, :2])
+    distance, bound = float(found.distance[i]), float(found.bound[i])
+    return {
+        "utility": finding.utility.name,
+        "kind": finding.utility.kind,
+        "nearest": False,
+        "verdict": verdict_of(distance, bound, finding.utility.line.clearance),
+        "start_ns": found.time_ns[i],
+        "end_ns": found.time_ns[i],
+        "time_ns": found.time_ns[i],
+        "station": station[0],
+        "offset": offset[0],
+        **dict(zip(("e", "n", "h"), found.edge[i])),
+        **dict(zip(("axis_e", "axis_n", "axis_h"), found.axis[i])),
+        "distance": distance,
+        "bound": bound,
+        "sigma_own": found.sigma_own[i],
+        "sigma_common": found.sigma_common[i],
+        "sigma_line": found.sigma_line[i],
     }
