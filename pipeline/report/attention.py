@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.report import detector
+from pipeline.report import detector, utilities
 from pipeline.report.causes import cause_text, value_text
 from pipeline.report.evidence import MOVED_SIGMAS, Timeline
 from pipeline.report.facts import deviation_text, station_text
@@ -53,9 +53,15 @@ def attention(
 ) -> dict[str, Any]:
     """At most five remarks, and the rest, which is folded away but never dropped."""
     remarks = [
+        *(Remark(GRAVE, sentence, "utilities") for sentence in utilities.struck(inputs, units, words)),
         *_of_log(inputs, words),
         *_of_stations(inputs, units, words),
         *_of_causes(inputs, units, words),
+        *(
+            Remark(SERIOUS, sentence, "utilities")
+            for tell in (utilities.nearly, utilities.unseen)
+            for sentence in tell(inputs, units, words)
+        ),
         *_of_checks(inputs, words, statistics),
         *_of_network(inputs, words),
         *_of_coverage(inputs, words, timeline),

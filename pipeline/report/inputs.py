@@ -12,6 +12,7 @@ from pipeline.config import Machine, Site
 from pipeline.report.moments import Moment
 from pipeline.surface.alignment import Alignment
 from pipeline.surface.design import Design
+from pipeline.surface.utilities import Buried
 
 Table = Mapping[str, np.ndarray]
 
@@ -56,13 +57,16 @@ class ReportInputs:
     machine_file: FileSource
     site_file: FileSource
     named_files: Mapping[str, FileSource] = field(default_factory=dict)
-    """Files that site.toml names: ``design``, ``checks``."""
+    """Files that site.toml names: ``design``, ``checks``, ``utilities.<name>``."""
     alignment: Alignment | None = None
     """The line that stations run along, grid metres."""
     design: Design | None = None
     """The design, to draw it beside what was dug."""
+    utilities: tuple[Buried, ...] = ()
+    """What is buried, to draw it."""
     tables: Mapping[str, Table] = field(default_factory=dict)
-    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, sides, volumes, checks."""
+    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, sides, volumes, checks,
+    utilities."""
     detections: Mapping[str, Table] = field(default_factory=dict)
     """By camera; columns time_ns, tag_id and status."""
     moments: Sequence[Moment] = ()

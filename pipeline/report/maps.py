@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.ticker import FuncFormatter, MaxNLocator
 
-from pipeline.report import numbers, palette
+from pipeline.report import numbers, palette, utilities
 from pipeline.report.drawing import DEVIATION_MAP, WIDTH_IN, new_figure
 from pipeline.report.inputs import ReportInputs
 from pipeline.report.measured import Grid
@@ -137,6 +137,7 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
         ax.plot(*at, "^", ms=6, color=palette.INK, ls="", label="benchmark" if i == 0 else None)
         (dx, dy), ha, va = LABELS[i % len(LABELS)]
         ax.annotate(name, tuple(at), (dx, dy), textcoords="offset points", ha=ha, va=va, fontsize=7)
+    utilities.draw_on_plan(ax, inputs, sheet.place)
     for axis, start in ((ax.xaxis, sheet.corner[0]), (ax.yaxis, sheet.corner[1])):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], min_n_ticks=2))
         axis.set_major_formatter(FuncFormatter(lambda value, _, start=start: _coordinate(value + start)))
@@ -149,8 +150,8 @@ def plan(inputs: ReportInputs, line: Alignment, grid: Grid, units: Units) -> Fig
         Line2D([], [], color=palette.DESIGN, lw=0.7, ls=dashes, label="alignment"),
     ]
     known, names = ax.get_legend_handles_labels()
-    handles += [h for h, name in zip(known, names) if name in ("check shot", "benchmark")]
-    figure.legend(handles=handles, loc="outside upper left", ncols=4, handlelength=2.2)
+    handles += [h for h, name in zip(known, names) if name in ("check shot", "benchmark", "buried utility")]
+    figure.legend(handles=handles, loc="outside upper left", ncols=5, handlelength=2.2)
     _colour_bar(figure, ax, norm, inputs, units)
     _to_scale(figure, ax)
     busy = [sheet.place(part) for part in corners]

@@ -28,6 +28,7 @@ from pipeline.report import (
     palette,
     profiles,
     quantities,
+    utilities,
     views,
 )
 from pipeline.report.attention import attention
@@ -112,6 +113,7 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "checks": None if checks is None else measured.checks_table(checks, units, words),
         "check_kinds": causes.kinds_table(inputs, units, words),
         "diagnosis": causes.diagnosis(inputs, units, words),
+        "utilities": utilities.section(inputs, units, words),
         "check_statistics": _labelled_statistics(statistics, words),
         "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
         "error_budget": evidence.error_budget(inputs, units, words),
@@ -257,6 +259,13 @@ def _figures(
             )
         else:
             add("deviation_map", "as_built", None)
+        if utilities.lines_of(inputs):
+            add(
+                "utilities",
+                "",
+                lambda: utilities.distances(inputs, units, words),
+                text=utilities.described(inputs, units, words),
+            )
         compared = 0 if checks is None else int(measured.counted(checks).sum())
         if checks is not None and compared:
             add("checks", "", lambda: profiles.check_shots(checks, units), n=compared)

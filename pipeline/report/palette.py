@@ -63,6 +63,15 @@ VERDICTS = {
     "CANNOT TELL": VerdictStyle("CANNOT TELL", "?", "cannot-tell", "#5b4a00", "s"),
     "NOT REACHED": VerdictStyle("NOT REACHED", "\N{EN DASH}", "not-reached", "#4d565f", "_"),
 }
+UTILITY_VERDICTS = {
+    "STRIKE LIKELY": VerdictStyle("STRIKE LIKELY", "\N{HEAVY MULTIPLICATION X}", "fail", "#9a3f00", "X"),
+    "STRIKE POSSIBLE": VerdictStyle("STRIKE POSSIBLE", "!", "fail", "#9a3f00", "D"),
+    "NEAR MISS": VerdictStyle("NEAR MISS", "\N{WHITE UP-POINTING TRIANGLE}", "cannot-tell", "#5b4a00", "^"),
+    "CLEAR WHILE SEEN": VerdictStyle("CLEAR WHILE SEEN", "?", "cannot-tell", "#5b4a00", "s"),
+    "CLEAR": VerdictStyle("CLEAR", "\N{CHECK MARK}", "pass", "#0b4f8a", "o"),
+    "NOT APPROACHED": VerdictStyle("NOT APPROACHED", "\N{EN DASH}", "not-reached", "#4d565f", "_"),
+}
+"""Of buried utilities; colours and classes are those of the verdicts above."""
 UNKNOWN_VERDICT = VerdictStyle("NO VERDICT", "!", "no-verdict", "#4d565f", "D")
 
 CONTRASTS = (
@@ -102,7 +111,7 @@ GROUNDS = (PAPER, WASH, BAND, RIBBON, PASSED_OVER, NEVER_TOUCHED, RULE)
 
 def verdict_style(word: str) -> VerdictStyle:
     """How `word` is shown; a word that is not known here keeps its own spelling."""
-    known = VERDICTS.get(word.upper())
+    known = (VERDICTS | UTILITY_VERDICTS).get(word.upper())
     return known or VerdictStyle(word or UNKNOWN_VERDICT.word, *list(vars(UNKNOWN_VERDICT).values())[1:])
 
 

@@ -63,7 +63,7 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
             file_columns,
             [
                 {
-                    "what": words(f"provenance.{kind}"),
+                    "what": words(f"provenance.{kind.partition('.')[0]}"),
                     "name": source.name,
                     "origin": words(f"origins.{source.origin}")
                     if words.has(f"origins.{source.origin}")

@@ -59,7 +59,7 @@ def _gaps(inputs: ReportInputs, units: Units, words: Words) -> str:
 
 def _volume_columns(units: Units, words: Words) -> list[dict[str, Any]]:
     return [
-        column("kind", words("columns.kind")),
+        column("kind", words("columns.volume_kind")),
         column("volume", words("columns.volume"), units.volume, units.volume_digits),
         column("sigma", words("columns.sigma"), units.volume, units.volume_digits),
         column("sigma_own", words("columns.sigma_own"), units.volume, units.volume_digits),

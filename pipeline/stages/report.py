@@ -20,6 +20,7 @@ from pipeline.stages.pictures import views_of
 from pipeline.surface.design import read_design
 from pipeline.surface.drawing_exchange import dxf_bytes
 from pipeline.surface.landxml_out import landxml_bytes
+from pipeline.surface.utilities import read_utilities
 
 COLUMNS: dict[str, list[str] | None] = {
     "frames": ["camera", "time_ns"],
@@ -31,6 +32,7 @@ COLUMNS: dict[str, list[str] | None] = {
     "sides": None,
     "volumes": None,
     "checks": None,
+    "utilities": None,
 }
 """Columns that the page needs of each table; a shift has millions of rows of some."""
 DETECTION_COLUMNS = ["time_ns", "status"]
@@ -113,6 +115,7 @@ def gather(job: Job) -> ReportInputs:
         named_files={key: FileSource(file.name, "site", file.sha256) for key, file in job.files.items()},
         alignment=alignment,
         design=design,
+        utilities=read_utilities(job.site, {key: file.path for key, file in job.files.items()}),
         tables=tables,
         detections={
             camera: job.read_table("detections", DETECTION_COLUMNS, part=camera)
