@@ -193,6 +193,35 @@ def site_toml(spec: Specification, mounts: Mounts) -> str:
     return "\n".join(lines) + "\n"
 
 
+def utilities_toml(spec: Specification) -> str:
+    """Text that the site.toml beside the log has more than the one inside it: what was found out after the shift."""
+    if not spec.utilities:
+        return ""
+    unit = METRES_PER_UNIT[spec.unit]
+    place = Place(spec)
+    lines = [
+        "",
+        "# Buried lines, by the owner's plan and a locator; entered after the shift, so the log's own copy lacks them.",
+        "# Points run along the axis; sigma is of its place, horizontal and vertical.",
+    ]
+    for plan in spec.utilities:
+        ends = [
+            place.point(plan.station, y, plan.axis + plan.fall * y) for y in (-plan.reach_m, plan.reach_m)
+        ]
+        ends = [np.array(spec.origin) + p / unit for p in ends]
+        lines += [
+            f"[utilities.{plan.name}]",
+            f'kind = "{plan.kind}"',
+            "points = [",
+            *[f"  {_row(p, 3)}," for p in ends],
+            "]",
+            f"radius_mm = {plan.radius_mm}",
+            f"sigma_mm = {_row(np.array(plan.sigma_mm), 1)}",
+            f"clearance_mm = {plan.clearance_mm}",
+        ]
+    return "\n".join(lines) + "\n"
+
+
 def _pose(T: np.ndarray, sigma_mm: float, sigma_deg: float) -> str:
     return (
         f"{{ xyz_m = {_row(T[:3, 3], 5)}, rpy_deg = {_row(so3.to_rpy_deg(T[:3, :3]), 4)}, "

@@ -136,6 +136,26 @@ class Trench:
 
 
 @dataclass(frozen=True)
+class UtilityPlan:
+    """A straight buried line that crosses the trench."""
+
+    name: str
+    kind: str
+    station: float
+    """Where it crosses the alignment, metres."""
+    axis: float
+    """World z of its axis there, metres."""
+    fall: float
+    """Per metre to the left of the alignment."""
+    radius_mm: float
+    sigma_mm: tuple[float, float]
+    """Of its place, horizontal and vertical."""
+    clearance_mm: float = 500.0
+    reach_m: float = 8.0
+    """How far the plan shows it on either side."""
+
+
+@dataclass(frozen=True)
 class Specification:
     """One site, one machine, one job."""
 
@@ -167,6 +187,7 @@ class Specification:
     stick_marker_tilt_deg: float
     """Of its normal in the plane of the arm, from the belly of the stick towards the boom."""
     sensors: tuple[SensorPlan, ...]
+    utilities: tuple[UtilityPlan, ...] = ()
     width: int = 640
     height: int = 480
     focal: float = 850.0
@@ -258,6 +279,7 @@ def trench() -> Specification:
         sensors=(
             SensorPlan("bucket-pot", "/bucket/potentiometer", "potentiometer", "sensor_sample", "protobuf"),
         ),
+        utilities=(UtilityPlan("gas-main", "gas", 107.4, 0.230, -0.004, 80.0, (60.0, 30.0)),),
     )
 
 

@@ -43,6 +43,21 @@ def test_both_files_load_and_say_what_was_drawn(world):
     assert len(ids) == len(set(ids))
 
 
+def test_the_buried_line_crosses_the_trench_where_the_plan_says(world):
+    text = files.site_toml(world.spec, world.files) + files.utilities_toml(world.spec)
+    found = load_site(text, "site.toml").utilities
+    assert set(found) == {plan.name for plan in world.spec.utilities}
+    for plan in world.spec.utilities:
+        ends = grid_metres(world, np.ravel(found[plan.name].points)).reshape(2, 3)
+        unit = 1.0 if world.spec.unit == "m" else US_FOOT
+        middle = ends.mean(axis=0) - np.array(world.spec.origin) * unit
+        bearing = np.deg2rad(world.spec.bearing_deg)
+        along = (middle[:2] - world.spec.start) @ [np.cos(bearing), np.sin(bearing)]
+        assert along + world.spec.start_station == pytest.approx(plan.station, abs=2e-3)
+        assert middle[2] == pytest.approx(plan.axis, abs=2e-3)
+        assert np.linalg.norm(ends[1, :2] - ends[0, :2]) == pytest.approx(2 * plan.reach_m, abs=2e-3)
+
+
 def test_errors_of_the_files_follow_the_stated_covariances():
     """Over 150 seeds each element's error in its own sigmas has mean 0 and mean square 1."""
     spec = specification.trench()

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.errors import UsageError
 from pipeline.logs.reader import read_log
-from pipeline.synthetic import command, recording, specification, table
+from pipeline.synthetic import command, files, recording, specification, table
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "trench"
 
@@ -47,8 +47,11 @@ def test_the_log_carries_frames_readings_calibrations_and_both_files(folder):
         assert topics["/cab/bench/image"].schema_name == "foxglove.CompressedImage"
         assert topics["/cab/arm/calibration"].message_count == 1
         attachments = log.attachments()
-        for name in ("machine.toml", "site.toml"):
-            assert attachments[name] == (folder / name).read_bytes()
+        assert attachments["machine.toml"] == (folder / "machine.toml").read_bytes()
+        beside = (folder / "site.toml").read_bytes()
+        # What lies beside the log knows of the buried lines as well: they were entered after the shift.
+        assert beside == attachments["site.toml"] + files.utilities_toml(small()).encode()
+        assert b"[utilities.gas-main]" in beside and b"utilities" not in attachments["site.toml"]
         frames = list(log.frames({"bench": "/cab/bench/image", "arm": "/cab/arm/image"}))
         samples = list(log.samples({"pot": ("/bucket/potentiometer", "value")}))
     stamps = {name: np.array([f.time_ns for f in frames if f.camera == name]) for name in ("bench", "arm")}
