@@ -6,6 +6,9 @@ the surface with its floor, sigmas and states; what is measured is the whole pro
 
 Before that, 100,000 faces are read from LandXML (bar 3 s) and from a drawing, and a million points are put to station
 and offset beside a line with spirals.
+
+The same shift is held against 20 buried lines of 50 pieces each, half of them across the trench and half along it, from
+above its floor to two metres below: 10 s, and no more memory than a tenth of the input's.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ import numpy as np
 
 from benchmarks._results import keep_result
 from pipeline.surface.alignment import Alignment, from_elements, polyline
+from pipeline.surface.approach import Approaches, Line, approaches
 from pipeline.surface.as_built import as_built
 from pipeline.surface.clothoid import clothoid_to
 from pipeline.surface.design import ProfileDesign
@@ -37,6 +41,9 @@ NET = 225
 """Points along a side of the net of faces: 224 squares of two faces each way."""
 LANDXML_BAR = 3.0
 BESIDE = 1_000_000
+LINES, PIECES = 20, 50
+LINES_SECONDS_BAR, LINES_MEMORY_BAR = 10.0, 0.1
+"""Seconds, and what the process grows by as a share of the edge's arrays."""
 
 
 @dataclass(frozen=True)
@@ -170,6 +177,50 @@ def readings() -> list[Reading]:
     return found
 
 
+@dataclass(frozen=True)
+class LinesRow:
+    """One run over buried lines."""
+
+    epochs: int
+    lines: int
+    pieces: int
+    approaches: int
+    seconds: float
+    grown_share: float
+    """Growth of the process over the size of the edge's arrays."""
+
+
+def buried(alignment: Alignment) -> list[Line]:
+    """Lines across the trench and along it."""
+    rng = np.random.default_rng(1)
+    made = []
+    for number in range(LINES):
+        if number % 2:
+            offset = np.linspace(-12, 12, PIECES + 1)
+            station, h = rng.uniform(0, LENGTH_M) + 0.05 * offset, 98 - rng.uniform(-0.5, 2.0)
+        else:
+            station = np.linspace(0, LENGTH_M, PIECES + 1)
+            offset, h = np.full(PIECES + 1, rng.uniform(-3, 3)), 98 - rng.uniform(-0.5, 0.6)
+        points = np.column_stack([alignment.points(station, offset), np.full(PIECES + 1, h)])
+        made.append(Line(points[:-1], points[1:], np.full(PIECES, 0.1), 0.05, 0.05, 0.5))
+    return made
+
+
+def follow_lines(edge: CuttingEdge, alignment: Alignment) -> LinesRow:
+    """Approaches of a shift to all lines, after the code is compiled."""
+    lines = buried(alignment)
+    few = CuttingEdge(edge.time_ns[:50], edge.p_grid[:50], edge.seen[:50], edge.cov[:50], edge.common[:50])
+    approaches(few, lines[:1], 2.0)
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    started = time.perf_counter()
+    found: list[Approaches] = approaches(edge, lines, 2.0)
+    seconds = time.perf_counter() - started
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 - before
+    size = sum(part.nbytes for part in (edge.time_ns, edge.p_grid, edge.seen, edge.cov, edge.common))
+    count = sum(near.inside + near.touching + near.near for near in found)
+    return LinesRow(len(edge), LINES, LINES * PIECES, count, seconds, grown / size)
+
+
 def main() -> int:
     """Run, print the table and the line, keep the result."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -180,6 +231,8 @@ def main() -> int:
         print(f"{one.count:9d} {one.what:<24} {one.seconds:6.2f} s")
     alignment, design = trench()
     edge = shift(alignment, epochs)
+    # First, because later the largest size of the process is that of the surface.
+    lines = follow_lines(edge, alignment)
     started = time.perf_counter()  # numba's compiling included: a first run has it too
     built = as_built(edge, alignment, design, CELL_M)
     seconds = time.perf_counter() - started
@@ -194,9 +247,14 @@ def main() -> int:
         f"(bars {SECONDS_BAR:.0f} s, {MEGABYTES_BAR:.0f} MB); "
         f"{read[0].count:,} faces of LandXML in {read[0].seconds:.1f} s (bar {LANDXML_BAR:.0f} s)"
     )
-    keep_result("surface", [row, *read], line)
+    print(
+        f"lines: {lines.lines} of {PIECES} pieces, {lines.approaches} approaches in {lines.seconds:.1f} s, grown by "
+        f"{100 * lines.grown_share:.0f} % of the input (bars {LINES_SECONDS_BAR:.0f} s, {100 * LINES_MEMORY_BAR:.0f} %)"
+    )
+    keep_result("surface", [row, *read, lines], line)
     print(line)
-    return int(seconds > SECONDS_BAR or megabytes > MEGABYTES_BAR or read[0].seconds > LANDXML_BAR)
+    slow = seconds > SECONDS_BAR or read[0].seconds > LANDXML_BAR or lines.seconds > LINES_SECONDS_BAR
+    return int(slow or megabytes > MEGABYTES_BAR or lines.grown_share > LINES_MEMORY_BAR)
 
 
 if __name__ == "__main__":

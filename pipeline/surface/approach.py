@@ -253,7 +253,7 @@ def _follow(
                     if k == 0 or not swept[k - 1] or 0.5 * (before + here - travel[k - 1]) >= enough:
                         continue
                     control_points(k - 1, time_ns, p, swept, bend_ns, control)
-                    low, u = dip(control, travel[k - 1], before, here, enough, segments, at)
+                    low, u = dip(control, before, here, enough, segments, at)
                     epoch, now = k - 1, time_ns[k - 1] + int(u * (time_ns[k] - time_ns[k - 1]))
                     if not 0.0 < u < 1.0:
                         continue

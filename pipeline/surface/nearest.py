@@ -18,6 +18,8 @@ COLUMNS = 11
 """Of `measured`."""
 _UP = (0.0, 0.0, 1.0)
 """Taken for the line of approach where the edge is on the axis."""
+_DEEP = 64
+"""Pieces of a step that may wait: each halving leaves one, and thirty of them cut a kilometre into micrometres."""
 MIDDLE, HALF, RADIUS = 6, 9, 10
 """Columns of a line's segments (m, 11): start, end, middle, half the length, radius."""
 
@@ -36,12 +38,7 @@ def steps(time_ns, p, seen, cov, max_step_ns, bend_ns):  # pragma: no cover - co
     control = np.empty((4, 3, 3))
     for k in range(n - 1):
         control_points(k, time_ns, p, swept, bend_ns, control)
-        for j in range(3):
-            for i in range(3):
-                way = 0.0
-                for a in range(3):
-                    way += (control[j + 1, i, a] - control[j, i, a]) ** 2
-                travel[k] = max(travel[k], 3.0 * np.sqrt(way))
+        travel[k] = way_of(control)
     return swept, travel, spread
 
 
@@ -78,6 +75,19 @@ def on_the_way(control, u, edge):  # pragma: no cover - compiled
                 + 3.0 * u * v * (v * control[1, i, a] + u * control[2, i, a])
                 + u * u * u * control[3, i, a]
             )
+
+
+@njit(cache=True, nogil=True)
+def way_of(control):  # pragma: no cover - compiled
+    """The longest way that a place of the edge can go in a step with these control points."""
+    longest = 0.0
+    for j in range(3):
+        for i in range(3):
+            square = 0.0
+            for a in range(3):
+                square += (control[j + 1, i, a] - control[j, i, a]) ** 2
+            longest = max(longest, square)
+    return 3.0 * np.sqrt(longest)
 
 
 @njit(cache=True, nogil=True)
@@ -144,34 +154,91 @@ def nearest(edge, segments, at):  # pragma: no cover - compiled
 
 
 @njit(cache=True, nogil=True)
-def dip(control, way, before, after, enough, segments, at):  # pragma: no cover - compiled
+def dip(control, before, after, enough, segments, at):  # pragma: no cover - compiled
     """The smallest distance within a step and where it is (0 to 1), `ERROR_M` at most above the true one.
 
-    `before` and `after` are the distances at its ends, `way` how far a place of the edge goes at most. Nothing that is
-    not below `enough` is looked for.
+    `before` and `after` are the distances at its ends. Nothing that is not below `enough` is looked for. A piece of the
+    step is done with when its way is too short to get nearer, or when it stays behind a plane that the line is all
+    before: that of its middle, which does for an edge that is dragged along a pipe.
     """
     best, place = (before, 0.0) if before <= after else (after, 1.0)
-    edge, piece = np.empty((3, 3)), np.empty((128, 4))
-    piece[0, 0], piece[0, 1], piece[0, 2], piece[0, 3] = 0.0, 1.0, before, after
+    edge, n = np.empty((3, 3)), np.empty(3)
+    piece, ends = np.empty((_DEEP, 4, 3, 3)), np.empty((_DEEP, 4))
+    piece[0] = control
+    ends[0, 0], ends[0, 1], ends[0, 2], ends[0, 3] = 0.0, 1.0, before, after
     count = 1
     while count > 0:
         count -= 1
-        a, b, at_a, at_b = piece[count, 0], piece[count, 1], piece[count, 2], piece[count, 3]
-        if 0.5 * (at_a + at_b - way * (b - a)) >= min(best, enough) - ERROR_M or count > 125:
+        a, b, at_a, at_b = ends[count, 0], ends[count, 1], ends[count, 2], ends[count, 3]
+        way = way_of(piece[count])
+        if 0.5 * (at_a + at_b - way) >= min(best, enough) - ERROR_M or count + 2 > _DEEP:
             continue
         u = 0.5 * (a + b)
-        on_the_way(control, u, edge)
+        on_the_way(piece[count], 0.5, edge)
         at_u = nearest(edge, segments, at)
         if at_u < best:
             best, place = at_u, u
+        if _behind(piece[count], way, edge, at, segments, min(best, enough) - ERROR_M, n):
+            continue
         # The nearer half comes last onto the pile: it is looked at first and may spare the other.
-        for turn in range(2):
-            if (turn == 0) == (at_a <= at_b):
-                piece[count, 0], piece[count, 1], piece[count, 2], piece[count, 3] = u, b, at_u, at_b
-            else:
-                piece[count, 0], piece[count, 1], piece[count, 2], piece[count, 3] = a, u, at_a, at_u
-            count += 1
+        later_first = at_a <= at_b
+        for i in range(3):
+            for c in range(3):
+                p0, p1, p2, p3 = (
+                    piece[count, 0, i, c],
+                    piece[count, 1, i, c],
+                    piece[count, 2, i, c],
+                    piece[count, 3, i, c],
+                )
+                q0, q1, q2 = 0.5 * (p0 + p1), 0.5 * (p1 + p2), 0.5 * (p2 + p3)
+                r0, r1 = 0.5 * (q0 + q1), 0.5 * (q1 + q2)
+                first, last = (count + 1, count) if later_first else (count, count + 1)
+                piece[first, 0, i, c], piece[first, 1, i, c], piece[first, 2, i, c] = p0, q0, r0
+                piece[last, 1, i, c], piece[last, 2, i, c], piece[last, 3, i, c] = r1, q2, p3
+                piece[first, 3, i, c] = piece[last, 0, i, c] = 0.5 * (r0 + r1)
+        first, last = (count + 1, count) if later_first else (count, count + 1)
+        ends[first, 0], ends[first, 1], ends[first, 2], ends[first, 3] = a, u, at_a, at_u
+        ends[last, 0], ends[last, 1], ends[last, 2], ends[last, 3] = u, b, at_u, at_b
+        count += 2
     return best, place
+
+
+@njit(cache=True, nogil=True)
+def _behind(control, way, edge, at, segments, limit, n):  # pragma: no cover - compiled
+    """Whether a piece with this middle `edge`, of which `nearest` told `at`, stays beyond `limit` from the line."""
+    j, i = int(at[0]), int(at[1])
+    size = 0.0
+    for c in range(3):
+        n[c] = edge[i, c] + at[2] * (edge[i + 1, c] - edge[i, c])
+        n[c] -= segments[j, c] + at[3] * (segments[j, 3 + c] - segments[j, c])
+        size += n[c] * n[c]
+    if size < 1e-18:
+        return False
+    size = np.sqrt(size)
+    for c in range(3):
+        n[c] /= size
+    floor, reach = np.inf, 0.0
+    for point in range(3):
+        square = 0.0
+        for c in range(3):
+            square += (edge[point, c] - edge[1, c]) ** 2
+        reach = max(reach, np.sqrt(square))
+        for k in range(4):
+            height = 0.0
+            for c in range(3):
+                height += n[c] * (control[k, point, c] - edge[1, c])
+            floor = min(floor, height)
+    for other in range(len(segments)):
+        square = start = end = 0.0
+        for c in range(3):
+            square += (edge[1, c] - segments[other, MIDDLE + c]) ** 2
+            start += n[c] * (segments[other, c] - edge[1, c])
+            end += n[c] * (segments[other, 3 + c] - edge[1, c])
+        if floor - max(start, end) - segments[other, RADIUS] >= limit:
+            continue
+        if np.sqrt(square) - segments[other, HALF] - segments[other, RADIUS] - reach - 0.5 * way < limit:
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True)
