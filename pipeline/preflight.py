@@ -125,6 +125,17 @@ def _file_findings(site: Site, source: Source) -> Iterator[Finding]:
         yield Finding("error", str(error))
         return
     yield Finding("ok", f"{files['design'].name}: the design and its alignment can be read")
+    from pipeline.surface.utilities import read_utilities
+
+    try:
+        buried = read_utilities(site, {key: file.path for key, file in files.items()})
+    except PipelineError as error:
+        yield Finding("error", str(error))
+        return
+    if buried:
+        yield Finding(
+            "ok", f"{len(buried)} buried utilities: {', '.join(utility.name for utility in buried[:8])}"
+        )
     if site.checks is None:
         yield Finding(
             "warning",

@@ -22,8 +22,8 @@ MOST_EVENTS = 50
 MOST_DRAWN = 20
 """Lines of the figure, the gravest first."""
 DASHES: dict[str, Any] = {
-    "gas": (0, (6, 1.5, 1, 1.5)),
-    "water": (0, (7, 2)),
+    "gas": (0, (4, 1.2)),
+    "water": (0, (9, 3)),
     "power": (0, (2, 1.5)),
     "telecom": (0, (1, 1.2)),
     "sewer": (0, (10, 2, 2, 2, 2, 2)),
@@ -260,7 +260,7 @@ def draw_on_plan(ax: Axes, inputs: ReportInputs, place: Callable[[np.ndarray], n
     (left, right), (bottom, top) = ax.get_xlim(), ax.get_ylim()
     nearest = inputs.table("utilities")
     first = True
-    for utility in inputs.utilities:
+    for number, utility in enumerate(inputs.utilities):
         line = utility.line
         start, end = place(line.start[:, :2]), place(line.end[:, :2])
         share = np.linspace(0, 1, 60)[:, None, None]
@@ -279,7 +279,8 @@ def draw_on_plan(ax: Axes, inputs: ReportInputs, place: Callable[[np.ndarray], n
             label="buried utility" if first else None,
         )
         first = False
-        at = along[np.flatnonzero(inside)[-1]]
+        seen = np.flatnonzero(inside)
+        at = along[seen[-1 - 4 * number % len(seen)]]  # words of lines that lie together stand apart
         ax.annotate(
             f"{utility.kind} {utility.name}", tuple(at), (3, 3), textcoords="offset points", fontsize=6.5,
             color=palette.MUTED, ha="right" if at[0] > (left + right) / 2 else "left",

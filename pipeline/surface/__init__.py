@@ -4,5 +4,5 @@ All coordinates in this room are grid metres; files come in the grid unit and ar
 Modules: ``alignment`` ``clothoid`` (station and offset); ``landxml`` ``dxf`` ``profile_csv`` ``shots`` (what others
 hand us); ``plan_geometry`` ``long_profile`` ``pipe_run`` (files into geometry); ``design``; ``sweep`` ``lowest_pass``
 ``as_built`` (the cutting edge as a surface); ``decision`` (PASS, FAIL, CANNOT TELL); ``checks`` (the total station);
-``table`` (columns of the artefacts).
+``distance_bound`` ``nearest`` ``approach`` ``utilities`` (buried lines); ``table`` (columns of the artefacts).
 """

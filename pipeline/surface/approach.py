@@ -239,23 +239,25 @@ def _follow(
             at_least -= travel[k - 1]
             wide = max(wide, spread[k - 1])
         wide = _SPREAD * np.sqrt(wide * wide + of_line)
-        here, wanted = np.inf, max(clearance + wide, best)
+        here, wanted, passed = np.inf, max(clearance + wide, best), False
         if not swept[k] or (k > 0 and not swept[k - 1]):  # unseen stretches begin or end here, or go on
             wanted = max(wanted, reach)
         if at_least < wanted:
-            if before == np.inf and k > 0 and swept[k - 1]:
+            if before == np.inf and k > 0:
                 before = nearest(p[k - 1], segments, at)
             here = nearest(p[k], segments, at)
             at_least = here
             for turn in range(2):
                 if turn == 0:  # the step to this epoch
-                    enough = max(best, min(event_low, clearance + wide))
-                    if k == 0 or not swept[k - 1] or 0.5 * (before + here - travel[k - 1]) >= enough:
+                    covered = k > 0 and swept[k - 1]
+                    enough = max(best, min(event_low, clearance + wide)) if covered else reach
+                    if k == 0 or 0.5 * (before + here - travel[k - 1]) >= enough:
                         continue
                     control_points(k - 1, time_ns, p, swept, bend_ns, control)
                     low, u = dip(control, before, here, enough, segments, at)
                     epoch, now = k - 1, time_ns[k - 1] + int(u * (time_ns[k] - time_ns[k - 1]))
-                    if not 0.0 < u < 1.0:
+                    passed = not covered and low < reach  # on the straight way of a stretch without sight
+                    if not covered or not 0.0 < u < 1.0:
                         continue
                     on_the_way(control, u, edge)
                 else:  # and the epoch itself
@@ -287,7 +289,7 @@ def _follow(
         if not blind and (not swept[k - 1] if k > 0 else not seen[0]):
             blind, blind_from, blind_near = True, time_ns[max(k - 1, 0)], before < reach
         if blind:
-            blind_near = blind_near or here < reach
+            blind_near = blind_near or here < reach or passed
             if seen[k] or k == n - 1:
                 blind = False
                 if blind_near:

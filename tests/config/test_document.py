@@ -25,6 +25,61 @@ def complaint(load, text, old, new):
     return str(caught.value), wrong.splitlines()
 
 
+GAS = """
+[utilities.gas]
+kind = "gas"
+points = [[1000, 2005, 48], [1010, 2005, 48]]
+radius_mm = 100
+sigma_mm = [50, 80]
+"""
+
+
+def test_buried_lines_load_with_their_sigmas_in_metres(site_text):
+    site = load_site(site_text + GAS, "site.toml")
+    assert site.utilities["gas"].sigmas_m == (0.05, 0.08) and site.utilities["gas"].clearance_mm == 500
+    alike = load_site(site_text + GAS.replace("[50, 80]", "50"), "site.toml")
+    assert alike.utilities["gas"].sigmas_m == (0.05, 0.05)
+    of_file = GAS.replace(
+        "points = [[1000, 2005, 48], [1010, 2005, 48]]\nradius_mm = 100", 'file = "pipes.xml"'
+    )
+    assert load_site(site_text + of_file, "site.toml").utilities["gas"].radius_mm is None
+
+
+@pytest.mark.parametrize(
+    "old, new, line, said",
+    [
+        (", [1010, 2005, 48]", "", "[utilities.gas]", "at least two different points"),
+        ("1010, 2005, 48", "1000, 2005, 48", "[utilities.gas]", "at least two different points"),
+        (
+            "1010, 2005, 48",
+            "1010, 2_005_000, 48",
+            "points",
+            "gas.points: point 2 lies 2,003 km from grid.origin",
+        ),
+        ("1010, 2005, 48", "1010, nan, 48", "points", "gas.points.1.1: should be a finite number"),
+        ("1010, 2005, 48", "1010, 48", "points", "gas.points.1: has too few values"),
+        ("[1010, 2005, 48]", ", ".join(["[1, 2, 3]"] * 2001), "points", "at most 2000 items"),
+        ('"gas"', '"oil"', "kind", "gas.kind: should be 'gas', 'water', 'power'"),
+        ("radius_mm = 100", "radius_mm = 6000", "radius_mm", "less than or equal to 5000"),
+        ("radius_mm = 100\n", "", "[utilities.gas]", "points need radius_mm"),
+        ("sigma_mm = [50, 80]", "", "[utilities.gas]", "sigma_mm: is missing"),
+        ("[50, 80]", "[50, -1]", "sigma_mm", "greater than or equal to 0"),
+        ("radius_mm = 100", 'radius_mm = 100\nfile = "a.xml"', "[utilities.gas]", "give either points"),
+        ("radius_mm = 100", 'radius_mm = 100\nnetwork = "a"', "[utilities.gas]", "network goes with file"),
+    ],
+)
+def test_mistakes_in_buried_lines_name_file_and_line(site_text, old, new, line, said):
+    message, lines = complaint(load_site, site_text + GAS, old, new)
+    assert said in message
+    number = int(re.search(r"a/file\.toml:(\d+): utilities\.gas", message).group(1))
+    assert lines[number - 1].startswith(line)
+
+
+def test_more_than_200_buried_lines_are_refused(site_text):
+    with pytest.raises(ConfigError, match=r"utilities: .* at most 200 items"):
+        load_site(site_text + "".join(GAS.replace("gas]", f"gas{i}]") for i in range(201)), "site.toml")
+
+
 MACHINE_MISTAKES = [
     # old, new, the line that is shown, key, what is said
     (
