@@ -193,7 +193,7 @@ def site_toml(spec: Specification, mounts: Mounts) -> str:
     return "\n".join(lines) + "\n"
 
 
-def utilities_toml(spec: Specification) -> str:
+def afterwards_toml(spec: Specification) -> str:
     """Text that the site.toml beside the log has more than the one inside it: what was found out after the shift."""
     if not spec.utilities:
         return ""
@@ -201,7 +201,12 @@ def utilities_toml(spec: Specification) -> str:
     place = Place(spec)
     lines = [
         "",
-        "# Buried lines, by the owner's plan and a locator; entered after the shift, so the log's own copy lacks them.",
+        "# Entered after the shift, so the log's own copy lacks it: the yard before digging, for volumes.",
+        "[ground]",
+        f"elevation = {spec.origin[2] + spec.ground / unit:.3f}",
+        "sigma_mm = 20.0",
+        "",
+        "# Buried lines, by the owner's plan and a locator.",
         "# Points run along the axis; sigma is of its place, horizontal and vertical.",
     ]
     for plan in spec.utilities:

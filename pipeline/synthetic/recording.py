@@ -113,7 +113,7 @@ def record(
     site = files.site_toml(spec, w.files)
     for name, text in (
         ("machine.toml", machine),
-        ("site.toml", site + files.utilities_toml(spec)),
+        ("site.toml", site + files.afterwards_toml(spec)),
         ("design.csv", survey.design_csv(spec)),
         ("design.xml", survey.design_xml(spec)),
         ("checks.csv", _checks(w)),

@@ -44,7 +44,7 @@ def test_both_files_load_and_say_what_was_drawn(world):
 
 
 def test_the_buried_line_crosses_the_trench_where_the_plan_says(world):
-    text = files.site_toml(world.spec, world.files) + files.utilities_toml(world.spec)
+    text = files.site_toml(world.spec, world.files) + files.afterwards_toml(world.spec)
     found = load_site(text, "site.toml").utilities
     assert set(found) == {plan.name for plan in world.spec.utilities}
     for plan in world.spec.utilities:

@@ -49,8 +49,8 @@ def test_the_log_carries_frames_readings_calibrations_and_both_files(folder):
         attachments = log.attachments()
         assert attachments["machine.toml"] == (folder / "machine.toml").read_bytes()
         beside = (folder / "site.toml").read_bytes()
-        # What lies beside the log knows of the buried lines as well: they were entered after the shift.
-        assert beside == attachments["site.toml"] + files.utilities_toml(small()).encode()
+        # What lies beside the log knows of the ground and the buried lines as well: they were entered after the shift.
+        assert beside == attachments["site.toml"] + files.afterwards_toml(small()).encode()
         assert b"[utilities.gas-main]" in beside and b"utilities" not in attachments["site.toml"]
         frames = list(log.frames({"bench": "/cab/bench/image", "arm": "/cab/arm/image"}))
         samples = list(log.samples({"pot": ("/bucket/potentiometer", "value")}))
