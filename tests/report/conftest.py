@@ -146,6 +146,37 @@ def stations_table(rng, n=36, step=0.5):
     }
 
 
+def sides_and_volumes(stations):
+    """Tables of the sides and the volumes of made-up stations."""
+    gone = stations["verdict"] == "NOT REACHED"
+    n = len(gone)
+    outward = np.column_stack([0.02 * np.sin(stations["station"]), 0.015 * np.cos(stations["station"])])
+    outward[gone] = np.nan
+    outward[3, 1] = np.nan
+    known = np.isfinite(outward)
+    sides = {
+        "station": np.repeat(stations["station"], 2),
+        "side": np.tile(np.array(["left", "right"], object), n),
+        "outward": outward.ravel(),
+        "sigma_own": np.where(known, 0.004, np.nan).ravel(),
+        "sigma_common": np.where(known, 0.003, np.nan).ravel(),
+        "slope": np.where(known, 0.52, np.nan).ravel(),
+        "sigma_slope": np.where(known, 0.04, np.nan).ravel(),
+        "expanded_uncertainty": np.where(known, 0.01, np.nan).ravel(),
+        "verdict": np.where(known, "PASS", "NOT REACHED").astype(object).ravel(),
+        "reason": np.full(2 * n, "", object),
+    }
+    volumes = {
+        "station": np.repeat(stations["station"], 3),
+        "kind": np.tile(np.array(["cut", "left to cut", "over-dug"], object), n),
+        "volume": np.column_stack([np.where(gone, 0.0, 1.15), np.full(n, 0.02), np.full(n, 0.005)]).ravel(),
+        "sigma_own": np.full(3 * n, 0.003),
+        "sigma_common": np.full(3 * n, 0.004),
+        "area": np.repeat(np.where(gone, 0.0, 0.6), 3),
+    }
+    return sides, volumes
+
+
 def as_built_table(rng, stations):
     s = np.arange(100.025, 118.0, 0.05)
     o = np.arange(-0.875, 0.9, 0.05)
@@ -299,6 +330,7 @@ def made_up_inputs(unit="m", seed=7):
     """The whole made-up run for a site whose grid is in `unit`."""
     rng = np.random.default_rng(seed)
     stations = stations_table(rng)
+    sides, volumes = sides_and_volumes(stations)
     views = (
         view(),
         view((106.25, 106.75), "stickcam", 1),
@@ -327,6 +359,8 @@ def made_up_inputs(unit="m", seed=7):
             "cutting_edge": edge,
             "as_built": as_built_table(rng, stations),
             "stations": stations,
+            "sides": sides,
+            "volumes": volumes,
             "checks": checks_table(rng),
         },
         detections=detections,
@@ -441,6 +475,22 @@ def candidate(kind, name="", component="", unit="m", value=0.012, w=6.0):
 
 SURVEY = {
     "verdict": "FAIL",
+    "reach": {"first": 100.0, "last": 116.5, "dug": 16.0, "gaps": [[108.0, 108.5]], "sigma": 0.0144},
+    "uncut_floor": 0.6,
+    "left_where_not_cut": 2.5,
+    "side_tolerance": {"wide": 0.05, "narrow": 0.02},
+    "volumes": [
+        {"kind": "cut", "m3": 38.05, "sigma_own": 0.03, "sigma_common": 0.04, "area": 19.8},
+        {"kind": "left to cut", "m3": 3.125, "sigma_own": 0.006, "sigma_common": 0.008, "area": 1.2},
+        {"kind": "over-dug", "m3": 0.18, "sigma_own": 0.012, "sigma_common": 0.005, "area": 9.0},
+    ],
+    "wanted_shots": {
+        "shots": [{"station": 110.25, "settles": 0.75}, {"station": 108.25, "settles": 1.25}],
+        "open": 2,
+        "partly": 1,
+        "best_alone": 1.5,
+        "sigma_shot": 0.002,
+    },
     "checks": {
         **CHECKED,
         "kinds": {

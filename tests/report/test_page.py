@@ -76,7 +76,7 @@ def test_every_label_names_an_element_that_is_there(read):
 def test_every_figure_is_described_and_says_what_good_looks_like(page, read):
     pictures = [found for tag, found in read.tags if tag == "svg"]
     drawn = [name for name, about in page.content["figures"].items() if not about["why"]]
-    assert len(pictures) == len(drawn) == 14
+    assert len(pictures) == len(drawn) == 15
     assert all(found.get("role") == "img" and found.get("aria-labelledby") for found in pictures)
     for name in drawn:
         about = page.content["figures"][name]
