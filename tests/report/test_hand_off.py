@@ -78,7 +78,8 @@ def test_checks_csv_is_report_json(made, content, tmp_path, reader):
     kinds = {"dtype": {"point": str}} if reader == "pandas" else {}
     frame = csv_rows(written(made[1], "checks", tmp_path), reader, **kinds)
     table, unit = content["checks"], content["units"]
-    for key, of in (("station", "length"), ("difference", "deviation"), ("sigma", "deviation")):
+    falls = ("difference", "sigma_own", "sigma_common")
+    for key, of in (("station", "length"), *((name, "deviation") for name in falls)):
         np.testing.assert_array_equal(frame[f"{key} [{unit[of]}]"].to_numpy(float), column(table, key))
     if reader == "pandas":
         assert frame["point"].tolist() == [row["point"] for row in table["rows"]]
