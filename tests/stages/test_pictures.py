@@ -108,6 +108,12 @@ def job(tmp_path):
     log = tmp_path / "shift.mcap"
     with LogWriter(log, chunk_size=20_000) as writer:
         for k in range(FRAMES):
+            if k == 123:
+                # A driver that sends an old picture again: received in the same instant, stamped earlier.
+                again = simplejpeg.encode_jpeg(grey(222)[..., None], 95, "GRAY", "Gray")
+                writer.image(
+                    "/left", stamp(100, "left"), "left", again, log_time_ns=stamp(k, "left") + DELAY["left"]
+                )
             writer.image(
                 "/left",
                 stamp(k, "left"),
