@@ -119,6 +119,25 @@ def test_the_axis_of_a_pipe_lies_half_its_inside_diameter_above_its_invert():
     assert radius.tolist() == [0.25, 0.25] and start[:, 2].tolist() == pytest.approx([49.25, 49.05])
 
 
+def test_pipes_are_read_from_the_file_that_site_toml_names(folder):  # noqa: F811
+    """In feet, as LandXML states diameters of a file in feet: inches."""
+    unit = 1200 / 3937
+    (folder / "pipes.xml").write_text(
+        '<LandXML><Units><Imperial linearUnit="USSurveyFoot" diameterUnit="inch"/></Units><PipeNetworks>'
+        '<PipeNetwork name="storm"><Structs>'
+        '<Struct name="A"><Center>4123000 512000</Center><Invert elev="49.2" flowDir="out" refPipe="P1"/></Struct>'
+        '<Struct name="B"><Center>4123010 512001</Center><Invert elev="49" flowDir="in" refPipe="P1"/></Struct>'
+        '</Structs><Pipes><Pipe name="P1" refStart="A" refEnd="B"><CircPipe diameter="12"/></Pipe></Pipes>'
+        "</PipeNetwork></PipeNetworks></LandXML>"
+    )
+    site = site_with(PIPES, "us_survey_foot")
+    (found,) = read_utilities(site, {"utilities.pipes": folder / "pipes.xml"})
+    # The invert plus six inches: they and a US survey foot differ by 2 in a million, far under what is held here.
+    assert found.line.start / unit == pytest.approx(np.array([[512000, 4123000, 49.7]]), abs=1e-5)
+    assert found.line.end / unit == pytest.approx(np.array([[512001, 4123010, 49.5]]), abs=1e-5)
+    assert found.line.radius[0] == pytest.approx(0.1524, abs=1e-6)
+
+
 def test_files_of_pipes_that_cannot_be_used_are_one_sentence(monkeypatch, folder):  # noqa: F811
     site = site_with(PIPES)
     pipes = site.utilities["pipes"]
@@ -127,12 +146,12 @@ def test_files_of_pipes_that_cannot_be_used_are_one_sentence(monkeypatch, folder
     with pytest.raises(SurfaceError, match=r"holds no network 'gas', but 'storm', 'water'"):
         pipes_of(storm(), pipes.model_copy(update={"network": "gas"}), site, "pipes")
     with pytest.raises(SurfaceError, match=r"holds no pipe, but no pipes at all"):
-        pipes_of(replace(storm(), pipes=()), pipes.model_copy(update={"network": None}), site, "pipes")
+        pipes_of(replace(storm(), placed_pipes=()), pipes.model_copy(update={"network": None}), site, "pipes")
     with pytest.raises(SurfaceError, match=r"no diameter of pipe 'P1'; give radius_mm of utilities.pipes"):
         pipes_of(storm(diameter=None), pipes, site, "pipes")
     swapped = tuple(replace(p, start=(p.start[1], p.start[0], p.start[2])) for p in storm().pipes)
     with pytest.raises(SurfaceError, match=r"pipe 'P2' lies 5,\d\d\d km from grid.origin"):
-        pipes_of(replace(storm(), pipes=swapped), pipes, site, "pipes")
+        pipes_of(replace(storm(), placed_pipes=swapped), pipes, site, "pipes")
     monkeypatch.setattr(utilities, "MAX_SEGMENTS", 2)
     with pytest.raises(SurfaceError, match=r"4 straight pieces in all, at most 2"):
         read_utilities(site_with(LINES), {})
