@@ -6,7 +6,6 @@ are the largest there are.
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,19 @@ SECOND = 1_000_000_000
 START_NS = 1_750_000_000 * SECOND
 WIDTH_M, CELL_M, STEP_M = 1.2, 0.05, 0.5
 SIZE = (1280, 960)
+SITE = """[alignment]
+points = [[356131.0, 5812424.0], [{end}, 5812424.0]]
+start_station = 0.0
+[design]
+file = "design.csv"
+kind = "profile_csv"
+[tolerance]
+high_mm = 30.0
+low_mm = 30.0
+[checks]
+file = "checks.csv"
+order = "PNEZD"
+"""
 TAGS = {"bench": (10, 11, 12, 13), "arm": (1, 2)}
 """Camera -> tags that it sees in every frame."""
 
@@ -47,17 +59,19 @@ def job_of_a_shift(folder: Path, hours: float, rate_hz: float, length_m: float) 
     _write(job, "as_built", cells)
     _write(job, "stations", stations)
     _write(job, "checks", _checks(rng, stations))
+    for name, columns in _sides_and_volumes(stations).items():
+        _write(job, name, columns)
+    _write(job, "utilities", tables.empty_columns("utilities"))
     _write(job, "statics", _statics(rng))
     _facts(job, frames)
     return job.at(stage_named("report"), "f" * 64)
 
 
 def _describe(folder: Path, length_m: float) -> None:
-    """The sample's machine on a trench as long as wanted, to the east."""
+    """The sample's machine and benchmarks on a trench as long as wanted, to the east."""
     (folder / "machine.toml").write_text((SAMPLE / "machine.toml").read_text())
     site = (SAMPLE / "site.toml").read_text()
-    line = f"points = [[356131.0, 5812424.0], [{356131.0 + length_m}, 5812424.0]]\nstart_station = 0.0\n"
-    site = re.sub(r"points = \[\n.*?\]\nstart_station = [\d.]+\n", line, site, flags=re.S)
+    site = site[: site.index("[alignment]")] + SITE.format(end=356131.0 + length_m)
     (folder / "site.toml").write_text(site)
     end = f"{length_m},{34.8 - 0.005 * length_m},{WIDTH_M},0"
     (folder / "design.csv").write_text(f"station,elevation,width,side_slope\n0,34.8,{WIDTH_M},0\n{end}\n")
@@ -125,6 +139,7 @@ def _ground(length_m: float, times: np.ndarray) -> tuple[dict, dict]:
         "sigma_own": np.where(known, rng.uniform(0.002, 0.004, len(centre)), np.nan),
         "sigma_common": np.where(known, 0.0035, np.nan),
         "expanded_uncertainty": np.where(known, 0.01, np.nan),
+        "scatter": np.where(known, 0.003, np.nan),
         "width": np.where(known, WIDTH_M, np.nan),
         "cells_cut": np.where(known, each, 0).astype(np.int32),
         "cells_floor": each.astype(np.int32),
@@ -225,11 +240,33 @@ def _checks(rng: np.random.Generator, stations: dict[str, np.ndarray], n: int = 
         "station": station,
         "as_built_h": 34.8 - 0.005 * station + difference,
         "difference": difference,
+        "kind": np.full(n, "floor", object),
+        "edge_point": np.full(n, "", object),
+        "sigma_own": np.full(n, 0.003),
+        "sigma_common": np.full(n, 0.004),
+        **{name: np.full(n, np.nan) for name in ("difference_e", "difference_n", "sigma_e", "sigma_n")},
         "sigma": np.full(n, 0.005),
         "sigma_ts": np.full(n, 0.002),
         "z": difference / np.hypot(0.005, 0.002),
         "result": np.full(n, "compared", object),
     }
+    return found
+
+
+def _sides_and_volumes(stations: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
+    """Two sides and three volumes of every station."""
+    found = {}
+    for name, kind, words in (
+        ("sides", "side", ("left", "right")),
+        ("volumes", "kind", ("cut", "left to cut", "over-dug")),
+    ):
+        n = len(words) * len(stations["station"])
+        columns = {key: np.full(n, 0.01).astype(v.dtype) for key, v in tables.empty_columns(name).items()}
+        columns["station"] = np.repeat(stations["station"], len(words))
+        columns[kind] = np.tile(np.array(words, object), len(stations["station"]))
+        if name == "sides":
+            columns |= {"verdict": np.full(n, "PASS", object), "reason": np.full(n, "", object)}
+        found[name] = columns
     return found
 
 
