@@ -136,16 +136,29 @@ def _of_stations(inputs: ReportInputs, units: Units, words: Words) -> list[Remar
     remarks = []
     failed = np.flatnonzero(verdict == "FAIL")
     if len(failed):
-        worst = failed[np.argmax(np.abs(deviation[failed]))]
-        sentence = words(
-            "attention.fail",
-            n=len(failed),
-            all=len(verdict),
-            station=station_text(stations["station"][worst], units),
-            deviation=deviation_text(deviation[worst], units),
-            u=deviation_text(u[worst], units, signed=False),
-            side=words("summary.high" if deviation[worst] > 0 else "summary.low"),
-        )
+        # A station may fail by a side alone: its level is then no reason to give.
+        tolerance = inputs.site.tolerance
+        high, low = deviation - u > tolerance.high_mm / 1000, deviation + u < -tolerance.low_mm / 1000
+        by_level = failed[(high | low)[failed]]
+        if len(by_level):
+            worst = by_level[np.argmax(np.abs(deviation[by_level]))]
+            sentence = words(
+                "attention.fail",
+                n=len(failed),
+                all=len(verdict),
+                station=station_text(stations["station"][worst], units),
+                deviation=deviation_text(deviation[worst], units),
+                u=deviation_text(u[worst], units, signed=False),
+                side=words("summary.high" if deviation[worst] > 0 else "summary.low"),
+            )
+        else:
+            sentence = words(
+                "attention.fail_side",
+                n=len(failed),
+                all=len(verdict),
+                station=station_text(stations["station"][failed[0]], units),
+                reason=stations["reason"][failed[0]],
+            )
         remarks.append(Remark(GRAVE, sentence, "stations"))
     # U = k sigma against the wider half of the tolerance's width: beyond it no deviation at all could pass.
     incapable = np.flatnonzero(u > (inputs.site.tolerance.high_mm + inputs.site.tolerance.low_mm) / 2000)
@@ -158,9 +171,10 @@ def _of_stations(inputs: ReportInputs, units: Units, words: Words) -> list[Remar
         )
         remarks.append(Remark(GRAVE, sentence, "error_budget"))
     if unsure := int((verdict == "CANNOT TELL").sum()):
-        remarks.append(
-            Remark(SERIOUS, words("attention.cannot_tell", n=unsure, all=len(verdict)), "stations")
-        )
+        sentence = words("attention.cannot_tell", n=unsure, all=len(verdict))
+        if inputs.site.tolerance.wide_mm is not None:
+            sentence += " " + words("attention.unsure_side")
+        remarks.append(Remark(SERIOUS, sentence, "stations"))
     gone = np.flatnonzero(verdict == "NOT REACHED")
     if len(gone):
         sentence = words(
@@ -204,12 +218,18 @@ def _of_causes(inputs: ReportInputs, units: Units, words: Words) -> list[Remark]
 def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number] | None) -> list[Remark]:
     checks = inputs.table("checks")
     if statistics is None or checks is None:
-        return [Remark(SERIOUS, words("attention.no_checks"), "checks")]
-    remarks = []
+        others = checks is not None and bool(counted(checks, None).any())
+        remarks = [
+            Remark(SERIOUS, words("attention.no_floor_checks" if others else "attention.no_checks"), "checks")
+        ]
+    else:
+        remarks = []
+    if checks is None:
+        return remarks
     z = checks["z"][counted(checks, None)]
     if off := int((np.abs(z) > CHECK_OFF_SIGMAS).sum()):
         remarks.append(Remark(GRAVE, words("attention.check_off", n=off, all=len(z)), "checks"))
-    value = statistics["reduced_chi_square"]["value"]
+    value = None if statistics is None else statistics["reduced_chi_square"]["value"]
     if value is not None and value > CHI_SQUARE_HIGH:
         remarks.append(Remark(SERIOUS, words("attention.chi_square", value=text_of(value, 2)), "checks"))
     return remarks

@@ -28,6 +28,7 @@ def method(inputs: ReportInputs, units: Units, words: Words) -> list[str]:
     return [
         words("method.sign"),
         words("method.rule", low=low, high=high),
+        *([rules["sides"]] if rules.get("sides") else []),
         words("method.sigma", k=k),
         surface,
         *([rules["floor"]] if rules.get("floor") else []),

@@ -123,11 +123,16 @@ def sides_table(inputs: ReportInputs, units: Units, words: Words) -> dict[str, A
     judged = bool(inputs.survey.get("side_tolerance"))
     columns = [column("station", words("columns.station"), units.length, units.station_digits)]
     for side in ("left", "right"):
+        named = words(f"columns.side_{side}")
         columns += [
             column(side, words(f"columns.{side}"), fall, digits, signed=True),
-            column(f"u_{side}", words("columns.u"), fall, digits),
-            *([column(f"verdict_{side}", words("columns.verdict"), kind="judged")] if judged else []),
-            column(f"slope_{side}", words("columns.slope"), "", 2),
+            column(f"u_{side}", words("columns.u_side", side=named), fall, digits),
+            *(
+                [column(f"verdict_{side}", words("columns.verdict_side", side=named), kind="judged")]
+                if judged
+                else []
+            ),
+            column(f"slope_{side}", words("columns.slope_side", side=named), "", 2),
         ]
     k = inputs.site.tolerance.coverage_factor
     rows = []

@@ -88,6 +88,7 @@ from pipeline.surface.decision import (
     job_verdict,
     judge,
     judge_sides,
+    side_sentence,
     stations_along,
     with_sides,
 )
@@ -132,17 +133,18 @@ def run(job: Job, progress: Progress) -> Counts:
     )
     step_m = site.station_step_m
     where = stations_along(design, alignment.start_station, alignment.end_station, step_m)
-    stations = judge(built, design, where, step_m, band)
+    stations = levels = judge(built, design, where, step_m, band)
     both_sides = sides(path, built, design, where, step_m, rule.sweep)
     judged: SideVerdicts | None = None
     across = _side_band(site.tolerance)
     if across is not None:
         judged = judge_sides(both_sides, across)
-        stations = with_sides(stations, judged)
+        stations = with_sides(levels, judged)
     verdict = job_verdict(stations)
     soil = volumes(built, design, ground, both_sides.rows, where, step_m)
     sigma_shot_m = site.checks.sigma_mm / 1000 if site.checks else SIGMA_SHOT_M
-    wanted = wanted_shots(stations, band, sigma_shot_m)
+    sides_pass = None if judged is None else np.all(judged.verdict == PASS, axis=1)
+    wanted = wanted_shots(levels, band, sigma_shot_m, only=sides_pass)
     progress.advance()
 
     job.write_table("as_built", table.columns_of_as_built(built, NULL_INT))
@@ -189,6 +191,7 @@ def run(job: Job, progress: Progress) -> Counts:
                 "surface": rule.sentence(),
                 "floor": floor_sentence(design),
                 "decision": band.sentence(),
+                "sides": None if across is None else side_sentence(across),
             },
             "tolerance": {
                 "high": band.high_m,
@@ -216,6 +219,11 @@ def run(job: Job, progress: Progress) -> Counts:
         },
     )
     progress.advance()
+    if soil.groundless_m2 > 0:
+        progress.warn(
+            f"the ground of site.toml does not reach over {soil.groundless_m2:.1f} m² of what was dug or was to be: "
+            "the volumes leave that out; give a ground that covers the trench"
+        )
     if isinstance(design, TinDesign) and design.floor_is_whole:
         progress.warn(
             f"the design surface '{design.name}' has no flat faces under the alignment: "

@@ -255,6 +255,15 @@ def judge_sides(sides: Sides, band: ToleranceBand) -> SideVerdicts:
     return SideVerdicts(u, verdict, reason)
 
 
+def side_sentence(band: ToleranceBand) -> str:
+    """The rule of the sides in words, for the report."""
+    return (
+        f"Each side of the floor is judged in the same way: it may lie up to {band.high_m * 1000:.4g} mm outside and "
+        f"{band.low_m * 1000:.4g} mm inside its designed place. A station fails by its level or by a side, and passes "
+        "only if its level and both sides pass."
+    )
+
+
 def with_sides(stations: Stations, sides: SideVerdicts) -> Stations:
     """The stations with their sides held against them: FAIL if the level or a side fails, PASS if all pass.
 

@@ -12,6 +12,7 @@ from typing import Protocol
 import numpy as np
 
 from pipeline.config.site import Site
+from pipeline.errors import SurfaceError
 from pipeline.surface.alignment import Alignment
 from pipeline.surface.design import check_elevation, check_unit, tin_of
 from pipeline.surface.landxml import read_landxml
@@ -80,4 +81,7 @@ def read_ground(path: Path | None, site: Site, alignment: Alignment) -> Ground |
     landxml = read_landxml(path)
     check_unit(landxml, site.grid.unit)
     surface = landxml.surface(wanted.surface, "ground.surface")
-    return Ground(tin_of(surface, landxml.source, alignment, site), sigma_m)
+    try:
+        return Ground(tin_of(surface, landxml.source, alignment, site), sigma_m)
+    except SurfaceError as error:
+        raise SurfaceError(f"the ground before digging (ground.file in site.toml): {error}") from None

@@ -39,8 +39,8 @@ class XmlPipe:
 @dataclass
 class _Struct:
     center: Place | None = None
-    inverts: list[tuple[str, str, float]] = field(default_factory=list)
-    """(pipe, direction of flow, elevation)"""
+    inverts: dict[str, list[tuple[str, float]]] = field(default_factory=dict)
+    """By pipe: direction of flow, elevation."""
 
 
 @dataclass
@@ -86,7 +86,7 @@ class PipeSection(Section):
             elevation = self.number(attributes, "elev", where)
             if elevation is not None:
                 flow = attributes.get("flowDir", "").lower()
-                self._struct.inverts.append((attributes.get("refPipe", ""), flow, elevation))
+                self._struct.inverts.setdefault(attributes.get("refPipe", ""), []).append((flow, elevation))
         elif name in _SHAPES and path[-2] == "Pipe":
             self._pipe.diameter = self.number(attributes, "diameter", f"pipe '{self._pipe.name}'")
         elif name == "Center" and path[-2] in ("Struct", "Pipe"):
@@ -143,11 +143,13 @@ class PipeSection(Section):
         corners = [start, end]
         if pipe.center is not None:
             corners = _chords(start, end, points.resolve(pipe.center, where))
+            for _ in corners[2:]:
+                self.count("pipes and structures")
         return [XmlPipe(network.name, pipe.name, a, b, diameter) for a, b in itertools.pairwise(corners)]
 
     def _invert(self, struct: _Struct, pipe: str, flow: str, where: str) -> float:
-        own = [invert for invert in struct.inverts if invert[0] == pipe]
-        levels = {level for _, direction, level in own if direction == flow} or {level for *_, level in own}
+        own = struct.inverts.get(pipe, [])
+        levels = {level for direction, level in own if direction == flow} or {level for _, level in own}
         if len(levels) != 1:
             raise SurfaceError(
                 f"{self.source}: {where} {len(levels) or 'no'} invert elevation{'s' if levels else ''}; export the "

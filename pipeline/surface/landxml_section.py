@@ -58,6 +58,10 @@ Place = tuple[float, float] | str
 """Easting and northing, or the name of the point that has them."""
 
 
+MAX_REFERENCES = 16
+"""From point to point until one has coordinates; files have one."""
+
+
 class PointSection(Section):
     """CgPoints: points with names, to which other parts refer."""
 
@@ -87,14 +91,14 @@ class PointSection(Section):
 
     def resolve(self, place: Place, where: str) -> tuple[float, float]:
         """Easting and northing of a place. Raises SurfaceError for a point that is not there, or there twice."""
-        seen = set()
+        seen: set[str] = set()
         while isinstance(place, str):
             if place in self._twice:
                 raise SurfaceError(
                     f"{self.source}: {where} refers to point '{place}', of which there are several; export the "
                     "coordinates themselves"
                 )
-            if place not in self._places or place in seen:
+            if place not in self._places or place in seen or len(seen) >= MAX_REFERENCES:
                 raise SurfaceError(
                     f"{self.source}: {where} refers to point '{place}', which the file does not hold; export the "
                     "points with it"

@@ -124,11 +124,21 @@ def differences_of(
         common = np.einsum("mj,mrj->mr", u, moved[:, factors])
     covariance += common @ common.T
     left_out = np.maximum(whole - np.einsum("mr,mr->m", common, common), 0.0)
+    covariance += _of_known_points(shots, at, u, comparison.sigma_ts[at])
     covariance[np.diag_indices(len(at))] += left_out + comparison.sigma_ts[at] ** 2
     causes = causes_of(answer, in_plan=not np.all(floor))
     return Differences(
         at, u, value, covariance, common, causes, signature_of(causes, answer, moved, u, heading)
     )
+
+
+def _of_known_points(shots: Shots, at: np.ndarray, u: np.ndarray, sigma_ts: np.ndarray) -> np.ndarray:
+    """(m, m) what visits of one known point share: its own survey, wrong in every visit alike; 0 on the diagonal."""
+    known = shots.kind[at] == "control"
+    same = known[:, None] & known[None, :] & (shots.point[at][:, None] == shots.point[at][None, :])
+    shared = np.where(same, np.outer(sigma_ts, sigma_ts) * (u @ u.T), 0.0)
+    np.fill_diagonal(shared, 0.0)
+    return shared
 
 
 def causes_of(answer: Sensitivities | None, in_plan: bool) -> tuple[Cause, ...]:

@@ -92,7 +92,7 @@ class Sides:
 
     @property
     def sigma_width_common(self) -> np.ndarray:
-        """(n,) metres: what the common errors of both sides do not cancel."""
+        """(n,) metres: what common errors across do not cancel; heights, which tell on sloped sides, are left out."""
         return np.abs(self.sigma_common[:, 0] - self.sigma_common[:, 1])
 
 

@@ -32,8 +32,10 @@ CUT, LEFT, OVER = "cut", "left to cut", "over-dug"
 KINDS = (CUT, LEFT, OVER)
 FAR_SIDE_M = 20.0
 """How far beside its floor a design is followed up to the ground where nothing was dug."""
-COARSE_M = 0.25
-"""Step along the alignment where nothing was dug: there the design and the ground alone make the volume."""
+COARSE_M, FINEST_M = 0.25, 0.05
+"""Step along the alignment, and least step across, where nothing was dug: design and ground alone make the volume."""
+PLACES = 500_000
+"""Looked up at once: a road of many kilometres must not need more memory than a trench."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,8 @@ class Volumes:
     """Part of the job's left to cut that lies where no cell was cut; nan without a ground."""
     uncut_m2: float
     """Plan area of the designed floor in the visited stretch where no cell was cut."""
+    groundless_m2: float
+    """Plan area of cut cells and floor over which a known ground does not reach: no volume holds what lies there."""
 
 
 def volumes(
@@ -113,7 +117,7 @@ def volumes(
 
     strips = _strips(built, ground_h, side_rows)
 
-    def over_rows(rows: slice) -> tuple[Volume, ...]:
+    def over_rows(rows: slice, elsewhere_m3: float = 0.0, elsewhere_m2: float = 0.0) -> tuple[Volume, ...]:
         cut = built.cut[rows]
         dug = cut & np.isfinite(built.design_h[rows])
         when = built.lowest_time_ns[rows]
@@ -135,9 +139,10 @@ def volumes(
         own_cut = np.sqrt(np.sum(sweeps_of(own[known], when[known]) ** 2)) * area
         common_cut = np.hypot(common[known].sum(), sigma_ground * np.count_nonzero(known)) * area
         soil = untouched[rows]
-        of_ground = sigma_ground * np.count_nonzero(soil) * area
+        soil_m2 = np.count_nonzero(soil) * area + elsewhere_m2
+        of_ground = sigma_ground * soil_m2
         edge = strips.over(rows)
-        left = (high[0] + float(soil.sum())) * area + edge.left_m3
+        left = (high[0] + float(soil.sum())) * area + edge.left_m3 + elsewhere_m3
         return (
             Volume(
                 CUT,
@@ -151,7 +156,7 @@ def volumes(
                 left,
                 float(np.hypot(high[1] * area, edge.sigma_own_m3)),
                 float(np.sqrt((high[2] * area) ** 2 + of_ground**2 + edge.sigma_common_m3**2)),
-                (high_cells + np.count_nonzero(soil)) * area,
+                high_cells * area + soil_m2,
             ),
             over_dug,
         )
@@ -160,22 +165,11 @@ def volumes(
         grid.station, np.concatenate([station - 0.5 * step_m, station[-1:] + 0.5 * step_m])
     )
     of_station = tuple(over_rows(slice(border[i], border[i + 1])) for i in range(len(station)))
-    job = over_rows(slice(0, grid.rows))
-    elsewhere = 0.0
+    elsewhere, plan = (0.0, 0.0)
     if ground is not None:
-        elsewhere, plan = _undug(built, design, ground)
-        left = job[1]
-        job = (
-            job[0],
-            Volume(
-                LEFT,
-                left.m3 + elsewhere,
-                left.sigma_own_m3,
-                left.sigma_common_m3 + sigma_ground * plan,
-                left.area_m2 + plan,
-            ),
-            job[2],
-        )
+        ends = (float(station[0] - 0.5 * step_m), float(station[-1] + 0.5 * step_m))
+        elsewhere, plan = _undug(built, design, ground, ends)
+    job = over_rows(slice(0, grid.rows), elsewhere, plan)
     floor = built.floor & np.isfinite(built.design_h)
     return Volumes(
         job=job,
@@ -183,6 +177,9 @@ def volumes(
         of_station=of_station,
         not_reached_m3=elsewhere + float(untouched.sum()) * area if ground is not None else np.nan,
         uncut_m2=np.count_nonzero(floor & ~built.cut) * area,
+        groundless_m2=0.0
+        if ground is None
+        else np.count_nonzero((built.cut | floor) & np.isnan(ground_h)) * area,
     )
 
 
@@ -242,17 +239,24 @@ def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
         reach = np.where(low, outward[None, :], -np.inf)
         last = np.argmax(reach, axis=1)
         rows = np.flatnonzero(low.any(axis=1))
+        # Where cells go on up a slope that was cut, they are counted already and the floor's side is no end of them.
+        beyond = last[rows] + int(sign)
+        inside = (beyond >= 0) & (beyond < grid.columns)
+        goes_on = inside & built.cut[rows, np.clip(beyond, 0, grid.columns - 1)]
         depth = depth_m[rows, last[rows]]
-        rows, depth = rows[np.isfinite(depth)], depth[np.isfinite(depth)]
+        keep = np.isfinite(depth) & np.isfinite(sides.border[rows, side]) & ~goes_on
+        rows, depth = rows[keep], depth[keep]
         counted = outward[last[rows]] + 0.5 * cell
-        reached = sides.border[rows, side] + sides.outward[rows, side]
+        border = sides.border[rows, side]
+        reached = border + sides.outward[rows, side]
         told = np.abs(reached - counted) <= 2 * cell
         strip = np.where(told, reached - counted, 0.0)
         cut_m3[rows, side] = strip * cell * depth
         # What is cut there is no longer left; outside the floor only a designed slope leaves soil to cut.
-        border = sides.border[rows, side]
         within = np.minimum(counted + strip, border) - np.minimum(counted, border)
-        sloped = np.isfinite(built.design_h[rows, np.argmax(outward[None, :] > border[:, None], axis=1)])
+        outer = np.where(outward[None, :] > border[:, None], outward[None, :], np.inf)
+        beside = np.argmin(outer, axis=1)
+        sloped = np.isfinite(outer.min(axis=1)) & np.isfinite(built.design_h[rows, beside])
         left_m3[rows, side] = -(within + np.where(sloped, strip - within, 0.0)) * cell * depth
         own[rows, side] = np.where(told, sides.own[rows, side], 0.0) * cell * depth
         common[rows, side] = np.where(told, sign * sides.common[rows, side], 0.0) * cell * depth
@@ -338,18 +342,21 @@ def _untouched(built: AsBuilt, ground_h: np.ndarray) -> np.ndarray:
     return np.where(np.isfinite(standing), np.maximum(standing, 0.0), 0.0)
 
 
-def _undug(built: AsBuilt, design: Design, ground: Ground) -> tuple[float, float]:
-    """Volume and plan area between design and ground outside the cells of the as-built surface."""
+def _undug(built: AsBuilt, design: Design, ground: Ground, ends: tuple[float, float]) -> tuple[float, float]:
+    """Volume and plan area between design and ground outside the cells of the surface, between two stations."""
     grid = built.grid
     first, last = design.station_range()
+    first, last = max(first, ends[0]), min(last, ends[1])
     reach = min(design.floor_reach(), 50.0) + FAR_SIDE_M
-    offset = np.arange(-reach + 0.5 * grid.cell_m, reach, grid.cell_m)
+    across_m = max(grid.cell_m, FINEST_M)
+    offset = np.arange(-reach + 0.5 * across_m, reach, across_m)
     low, high = grid.first_station, grid.first_station + grid.rows * grid.cell_m
     beside = (offset < grid.first_offset) | (offset > grid.first_offset + grid.columns * grid.cell_m)
+    everywhere = np.ones(len(offset), bool)
     total = plan = 0.0
     for begin, end, columns in (
-        (first, min(low, last), np.ones(len(offset), bool)),
-        (max(high, first), last, np.ones(len(offset), bool)),
+        (first, min(low, last), everywhere),
+        (max(high, first), last, everywhere),
         (max(low, first), min(high, last), beside),
     ):
         pieces = int(np.ceil((end - begin) / COARSE_M)) if end > begin else 0
@@ -357,9 +364,11 @@ def _undug(built: AsBuilt, design: Design, ground: Ground) -> tuple[float, float
             continue
         length = (end - begin) / pieces
         station = begin + (np.arange(pieces) + 0.5) * length
-        along, across = np.meshgrid(station, offset[columns], indexing="ij")
-        soil = ground.elevation(along, across) - design.elevation(along, across)
-        soil = np.where(np.isfinite(soil), np.maximum(soil, 0.0), 0.0)
-        total += float(soil.sum()) * length * grid.cell_m
-        plan += float(np.count_nonzero(soil)) * length * grid.cell_m
+        block = max(1, PLACES // int(np.count_nonzero(columns)))
+        for at in range(0, pieces, block):
+            along, across = np.meshgrid(station[at : at + block], offset[columns], indexing="ij")
+            soil = ground.elevation(along, across) - design.elevation(along, across)
+            soil = np.where(np.isfinite(soil), np.maximum(soil, 0.0), 0.0)
+            total += float(soil.sum()) * length * across_m
+            plan += float(np.count_nonzero(soil)) * length * across_m
     return total, plan

@@ -52,26 +52,34 @@ class WantedShots:
 
 
 def wanted_shots(
-    stations: Stations, band: ToleranceBand, sigma_shot_m: float, most: int = MOST_SHOTS
+    stations: Stations,
+    band: ToleranceBand,
+    sigma_shot_m: float,
+    most: int = MOST_SHOTS,
+    only: np.ndarray | None = None,
 ) -> WantedShots:
     """The shots that would settle most stations.
 
     Parameters
     ----------
     stations : Stations
-        As judged.
+        As judged by their level.
     band : ToleranceBand
         The tolerance.
     sigma_shot_m : float
         Standard deviation of a shot's elevation, metres.
     most : int
         No more shots than this.
+    only : (n,) bool array, optional
+        Stations for which a level is all that is wanting: a side that cannot be told, no level settles.
 
     Returns
     -------
     WantedShots
     """
     unsure = stations.verdict == CANNOT_TELL
+    if only is not None:
+        unsure = unsure & only
     partly = unsure & (stations.state == PARTLY)
     open_ = np.flatnonzero(unsure & ~partly & np.isfinite(stations.deviation))
     if not len(open_):

@@ -1,5 +1,7 @@
 """Volumes against closed forms, and one-sided sums against the bias of noise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from pipeline.surface.design import ProfileDesign
 from pipeline.surface.ground import Ground, LevelGround
 from pipeline.surface.sides import sides
 from pipeline.surface.sweep import path_along
-from pipeline.surface.volumes import CUT, LEFT, OVER, volumes
+from pipeline.surface.volumes import CUT, LEFT, OVER, _strips, volumes
 
 GROUND = Ground(LevelGround(52.0), 0.02)
 STATION = np.arange(0.0, 10.5, 0.5)
@@ -96,3 +98,50 @@ def test_side_slopes_are_followed_up_to_the_ground(trench):
     found, _ = of(trench, trench.passes([53.0]), design=flared)
     # Between floor and ground a prism of 1 m at the bottom and 3 m at the top; the edge flew above the ground.
     assert by_kind(found.job)[LEFT].m3 == pytest.approx(10 * (1.0 + 3.0) / 2 * 2.0, rel=0.01)
+
+
+@pytest.mark.parametrize("run", [0.25, 0.5, 1.0])
+def test_a_trapezoid_that_was_cut_to_its_slopes_keeps_its_volume(trench, run):
+    """Floor 1 m, 1.5 m deep, sides cut along the design: the floor's side is no end of what was cut."""
+    flared = ProfileDesign("d", np.array([0.0, 10.0]), np.full(2, 50.0), np.full(2, 1.0), np.full(2, run))
+    ground = Ground(LevelGround(51.5), 0.0)
+    count, columns = 60, np.arange(-0.475 - 1.5, 0.475 + 1.51, 0.05)
+    columns = columns[np.abs(columns) < 0.5 + 1.5 * run]
+    height = 50.0 + np.maximum(np.abs(columns) - 0.5, 0.0) / run
+    t = np.concatenate([k * 7 + np.arange(count) / 20 for k in range(len(columns))])
+    edge = trench.edge(
+        t,
+        np.tile(np.linspace(2, 8, count), len(columns)),
+        np.repeat(columns, count),
+        np.repeat(height, count),
+        width=0.04,
+    )
+    found, built = of(trench, edge, ground, flared)
+    assert built.cut[60].sum() >= len(columns) - 2
+    whole = 6.0 * (1.0 + 1.5 * run) * 1.5
+    print(f"run {run}: cut {by_kind(found.job)[CUT].m3:.3f} m³, closed form {whole:.3f}")
+    assert by_kind(found.job)[CUT].m3 == pytest.approx(whole, rel=0.025)
+
+
+def test_left_and_right_are_alike_and_a_design_beyond_the_stations_is_not_counted(trench):
+    flared = ProfileDesign("d", np.array([0.0, 500.0]), np.full(2, 50.0), np.full(2, 1.0), np.full(2, 0.5))
+    both = trench.passes([50.0], sigma=0.001)
+    found, built = of(trench, both, design=flared)
+    path = path_along(both, trench.alignment)
+    rows = sides(path, built, flared, STATION, 0.5).rows
+    wider = replace(rows, outward=np.full_like(rows.outward, 0.02))
+    strips = _strips(built, np.full(built.h.shape, 52.0), wider)
+    np.testing.assert_allclose(strips.left_m3[:, 0], strips.left_m3[:, 1], atol=1e-6)
+    # The design goes on for 500 m, the alignment and its stations end at 10.25: nobody digs the rest.
+    prism = (1.0 + 0.5 * 2.0) * 2.0
+    assert by_kind(found.job)[LEFT].m3 < 10.6 * prism
+
+
+def test_ground_that_ends_inside_the_trench_is_told(trench):
+    class Half:
+        def elevation(self, station, offset):
+            return np.where(station + 0 * offset < 5.0, 52.0, np.nan)
+
+    found, _ = of(trench, trench.passes([50.0]), Ground(Half(), 0.01))
+    assert found.groundless_m2 > 2.0
+    assert of(trench, trench.passes([50.0]))[0].groundless_m2 == 0.0

@@ -96,3 +96,9 @@ def test_nothing_is_asked_for_where_nothing_is_open_or_no_shot_would_help():
     assert set(stations([0.0], [0.001], [0.001]).verdict) == {PASS}
     hopeless = wanted_shots(stations([0.03], [0.001], [0.0]), BAND, 0.005)
     assert hopeless.open == 1 and hopeless.shots == ()
+
+
+def test_a_station_that_waits_for_a_side_is_not_shot():
+    at = stations(np.full(3, 0.02), 0.006, 0.004)
+    found = wanted_shots(at, BAND, SHOT_M, only=np.array([True, False, False]))
+    assert found.open == 1 and [shot.station for shot in found.shots] == [100.0]
