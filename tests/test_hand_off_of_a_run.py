@@ -58,7 +58,7 @@ def test_table_csv_and_report_json_agree(run, content, table):
     frame = pd.read_csv(run / f"{table}.csv")
     rows = stations_of(content) if table == "stations" else content["checks"]["rows"]
     assert len(parquet) == len(frame) == len(rows) > 0
-    keys = {"stations": ("deviation", "sigma_own"), "checks": ("difference", "sigma")}[table]
+    keys = {"stations": ("deviation", "sigma_own"), "checks": ("difference", "sigma_own")}[table]
     for key in keys:
         np.testing.assert_array_equal(frame[f"{key} [mm]"].to_numpy(float), numbers(rows, key))
         np.testing.assert_allclose(parquet[key].to_numpy(float) * 1000, numbers(rows, key), rtol=0, atol=6e-4)

@@ -65,7 +65,7 @@ def test_the_shots_to_take_stand_with_what_they_would_settle(made):
     wanted = page.content["wanted"]
     assert [row["settles"] for row in wanted["shots"]["rows"]] == [0.75, 1.25]
     assert wanted["shots"]["rows"][0]["station"] == pytest.approx(110.25 / METRES[unit], abs=1e-4)
-    assert "settle: 2" in wanted["sentence"] and "about 1.5" in wanted["sentence"]
+    assert "their level: 2" in wanted["sentence"] and "about 1.5" in wanted["sentence"]
     assert "only part of their floor was cut: 1" in wanted["sentence"]
 
 
