@@ -165,7 +165,7 @@ def volumes(
         grid.station, np.concatenate([station - 0.5 * step_m, station[-1:] + 0.5 * step_m])
     )
     of_station = tuple(over_rows(slice(border[i], border[i + 1])) for i in range(len(station)))
-    elsewhere, plan = (0.0, 0.0)
+    elsewhere = plan = 0.0
     if ground is not None:
         ends = (float(station[0] - 0.5 * step_m), float(station[-1] + 0.5 * step_m))
         elsewhere, plan = _undug(built, design, ground, ends)
