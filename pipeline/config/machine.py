@@ -10,6 +10,7 @@ import numpy as np
 from pydantic import Field, ValidationError, model_validator
 
 from pipeline.config.quantities import (
+    Calibrated,
     Identifier,
     Name,
     NonNegative,
@@ -89,6 +90,7 @@ class Intrinsics(Section):
     """Nine standard deviations: fx fy cx cy (px) k1 k2 p1 p2 k3."""
     covariance: tuple[tuple[float, ...], ...] | None = None
     """9x9, same order, instead of sigma."""
+    calibrated: Calibrated | None = None
 
     @model_validator(mode="after")
     def _one_uncertainty(self) -> Intrinsics:
@@ -144,6 +146,7 @@ class Curve(Section):
     covariance: tuple[tuple[float, ...], ...] | None = None
     raw_range: tuple[float, float] | None = None
     """Calibrated range of the raw reading; readings outside are dropped and counted."""
+    calibrated: Calibrated | None = None
 
     @model_validator(mode="after")
     def _one_uncertainty(self) -> Curve:
@@ -180,6 +183,7 @@ class Linkage(Section):
     sigma_mm: NonNegative
     """Standard deviation of each length and coordinate."""
     sigma_horn_angle_deg: NonNegative
+    calibrated: Calibrated | None = None
 
 
 class Sensor(Section):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from collections.abc import Collection
 from typing import Annotated
 
@@ -31,6 +32,21 @@ class Section(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, use_attribute_docstrings=True)
 
 
+class Calibrated(Section):
+    """Where a quantity comes from; written by the commands that calibrate."""
+
+    date: datetime.date
+    """Day of the recording, not of the computing."""
+    by: str = ""
+    """Command that told it."""
+    source: str = ""
+    """Name of the log or file it was told from."""
+    sha256: Annotated[str, Field(pattern=r"^([0-9a-f]{64})?$")] = ""
+    """Of that file."""
+    raw_range: tuple[float, float] | None = None
+    """Stroke over which a sensor's curve was told, raw unit: beyond it the curve is extrapolated."""
+
+
 class Pose(Section):
     """A calibrated rigid pose ``T_parent_child`` with the covariance of its right perturbation."""
 
@@ -44,6 +60,7 @@ class Pose(Section):
     """Standard deviation of the rotation about the child's axes, degrees; 0 means exact."""
     covariance: tuple[tuple[float, ...], ...] | None = None
     """6x6 covariance of ``xi = [rho, phi]`` in m and rad instead of the two sigmas."""
+    calibrated: Calibrated | None = None
 
     @model_validator(mode="after")
     def _one_uncertainty(self) -> Pose:

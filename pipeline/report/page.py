@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-import jinja2
 import numpy as np
-from markupsafe import Markup, escape
 from matplotlib.figure import Figure
 
 from pipeline.report import (
@@ -25,7 +23,6 @@ from pipeline.report import (
     maps,
     measured,
     numbers,
-    palette,
     profiles,
     quantities,
     utilities,
@@ -38,11 +35,11 @@ from pipeline.report.evidence import Timeline
 from pipeline.report.hand_off import AS_BUILT_POINTS, files_table, hand_off_of, points_table
 from pipeline.report.identity import identity, settings
 from pipeline.report.inputs import ReportInputs, Table
+from pipeline.report.printing import printed
 from pipeline.report.provenance import method, provenance
 from pipeline.report.report_file import FORMAT
 from pipeline.report.units import Units, text_of, units_of
 from pipeline.report.words import Words
-from pipeline.resources import template_folder
 from pipeline.surface.checks import ENOUGH
 from pipeline.surface.hand_off import HandOff
 
@@ -70,17 +67,7 @@ def render(inputs: ReportInputs, language: str = "en") -> Page:
         "files": files_table(exports, hand_off is not None, words),
         "as_built_points": exports.get(AS_BUILT_POINTS),
     }
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(template_folder()),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    environment.filters |= {"num": _num, "cell": _cell, "verdict": _verdict}
-    style = Markup((template_folder() / "style.css").read_text(encoding="utf-8"))
-    svg = {name: Markup(text) for name, text in pictures.items()}
-    html = environment.get_template("report.html").render(page=content, svg=svg, w=words, style=style)
+    html = printed("report.html", content, pictures, words)
     return Page(html, content, exports, hand_off)
 
 
@@ -350,28 +337,3 @@ def _median(stations: Table | None, name: str) -> float | None:
     """Of a column of the stations that were dug; None without any."""
     known = np.zeros(0) if stations is None else stations[name][np.isfinite(stations[name])]
     return float(np.median(known)) if len(known) else None
-
-
-def _num(value: numbers.Number, key: str) -> Markup:
-    """A number with its unit; `key` is its path in report.json, by which tests read the page back."""
-    shown = text_of(value["value"], value["digits"], value["signed"])
-    unit = Markup(' <span class="unit">{}</span>').format(value["unit"]) if value["unit"] else Markup("")
-    raw = "" if value["value"] is None else repr(value["value"])
-    return Markup('<data class="number" data-key="{}" value="{}">{}</data>{}').format(key, raw, shown, unit)
-
-
-def _cell(value: Any, column: dict[str, Any]) -> Markup:
-    """The content of a table's cell."""
-    if column["kind"] == "judged":
-        return _verdict(value)
-    if column["digits"] is None:
-        return escape(value)
-    return escape(text_of(value, column["digits"], column["signed"]))
-
-
-def _verdict(word: str) -> Markup:
-    """A verdict in symbol and word."""
-    style = palette.verdict_style(word)
-    return Markup('<span class="verdict {}"><span aria-hidden="true">{}</span> {}</span>').format(
-        style.slug, style.symbol, style.word
-    )

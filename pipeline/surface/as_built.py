@@ -151,7 +151,7 @@ def as_built(
     if rule.surface == "last":
         chosen = last_floor(passes.first, passes.height, passes.sigma_own)
     else:
-        chosen = lowest_floor(passes.first, passes.height, passes.sigma_own, rule.corrected)
+        chosen = lowest_floor(passes.first, passes.height, passes.sigma_own, rule.corrected, passes.time_ns)
     shape = (grid.rows, grid.columns)
     h = chosen.height.reshape(shape)
     kept = np.isfinite(h)

@@ -46,11 +46,9 @@ _NEVER = np.iinfo(np.int64).min // 2
 
 
 @dataclass(frozen=True)
-class SideRows:
-    """Sides of each row of cells; arrays (rows, 2): left, right; nan where no pass told them."""
+class Reached:
+    """Outermost passes of each row of cells; arrays (rows, 2): left, right; nan where no pass told them."""
 
-    border: np.ndarray
-    """Distance of the designed side from the alignment, metres."""
     outward: np.ndarray
     """How far the side lies outside the designed one, metres."""
     own: np.ndarray
@@ -59,6 +57,16 @@ class SideRows:
     """Common standard deviation, metres."""
     time_ns: np.ndarray
     """int64: when the outermost pass was."""
+
+
+@dataclass(frozen=True)
+class SideRows(Reached):
+    """Sides of each row of cells."""
+
+    border: np.ndarray
+    """(rows, 2) distance of the designed side from the alignment, metres."""
+    in_plan: Reached
+    """The outermost place of the edge as it lies, where `outward` goes down along the designed slope to the floor."""
 
 
 @dataclass(frozen=True)
@@ -129,20 +137,7 @@ def sides(
     grid = built.grid
     level = design.floor_level(grid.station)
     border, flare = _designed_sides(design, grid.station, level)
-    first, outward, own, common, time_ns = _passes(
-        path, grid.station, grid.cell_m, level, border, flare, round(settings.pass_gap_s * 1e9)
-    )
-    reached, sigma, of_pass = _outermost(first, outward, own)
-    nowhere = np.full(len(first) - 1, np.nan)
-    told = of_pass >= 0
-    shape = (grid.rows, 2)
-    at = SideRows(
-        border=border,
-        outward=reached.reshape(shape),
-        own=sigma.reshape(shape),
-        common=(np.where(told, common[of_pass], np.nan) if len(own) else nowhere).reshape(shape),
-        time_ns=(time_ns[of_pass] if len(own) else np.zeros(len(first) - 1, np.int64)).reshape(shape),
-    )
+    at = _rows(path, built, level, border, flare, settings)
     # A row tells its sides only where its floor was cut: a single pass beside an uncut floor is no side of it.
     cut_row = (built.cut & built.floor).any(axis=1)
     n = len(station)
@@ -193,6 +188,31 @@ def _designed_sides(design: Design, station: np.ndarray, level: np.ndarray) -> t
         sloped = there & np.isfinite(rise) & (rise > 1e-6)
         flare[:, side] = np.where(sloped, LOW_M / np.where(sloped, rise, 1.0), 0.0)
     return border, flare
+
+
+def _rows(
+    path: EdgePath,
+    built: AsBuilt,
+    level: np.ndarray,
+    border: np.ndarray,
+    flare: np.ndarray,
+    settings: SweepSettings,
+) -> SideRows:
+    grid = built.grid
+
+    def reached(flare: np.ndarray) -> Reached:
+        first, outward, own, common, time_ns = _passes(
+            path, grid.station, grid.cell_m, level, border, flare, round(settings.pass_gap_s * 1e9)
+        )
+        side, sigma, of_pass = _outermost(first, outward, own)
+        told = of_pass >= 0
+        shared, when = np.full(len(told), np.nan), np.zeros(len(told), np.int64)
+        shared[told], when[told] = common[of_pass[told]], time_ns[of_pass[told]]
+        return Reached(*(part.reshape(grid.rows, 2) for part in (side, sigma, shared, when)))
+
+    at = reached(flare)
+    in_plan = reached(np.zeros_like(flare)) if flare.any() else at
+    return SideRows(at.outward, at.own, at.common, at.time_ns, border, in_plan)
 
 
 def _passes(

@@ -8,9 +8,11 @@ the expectation of its one-sided deviation given its estimate, its noise and tha
     d | estimate  ~  N(m, v)      m = mean + k (estimate - mean),   v = k own²,   k = spread² / (spread² + own²)
     E max(d, 0)   =  m Phi(m / sqrt v) + sqrt v phi(m / sqrt v)
 
-The common error moves all cells alike: the sums are made again with all cells one common sigma higher and lower, and
-half the difference is the common part. The own part takes the cells of one sweep as sharing one error, as the
-stations do (`decision.py`).
+The common error moves all cells alike, and a floor that is seen to lie high by one common sigma may yet be over-dug:
+the sums are made with all cells moved by each of some draws of it (Gauss and Hermite's), and their mean and spread
+are the volume and its common part. Half the difference of one sigma up and down was tried first: of a floor without
+over-dug cells it made a volume of 0.0 with next to no sigma, 1.6 sigma RMS from the truth over 67 drawn trenches. The
+own part takes the cells of one sweep as sharing one error, as the stations do (`decision.py`).
 
 Cells are whole or nothing, and a side that runs along their borders would be wrong by half a cell all along: what the
 sides (`sides.py`) tell is added where they are told, and where they are not the rounding is in the sigma.
@@ -34,6 +36,9 @@ FAR_SIDE_M = 20.0
 """How far beside its floor a design is followed up to the ground where nothing was dug."""
 COARSE_M, FINEST_M = 0.25, 0.05
 """Step along the alignment, and least step across, where nothing was dug: design and ground alone make the volume."""
+_DRAWS, _WEIGHTS = np.polynomial.hermite_e.hermegauss(31)
+_WEIGHTS = _WEIGHTS / _WEIGHTS.sum()
+"""A normal error in 31 draws: the mean of its positive part comes out 3 % too small, with nine 9 %."""
 PLACES = 500_000
 """Looked up at once: a road of many kilometres must not need more memory than a trench."""
 
@@ -227,14 +232,13 @@ def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
     shape = (grid.rows, 2)
     cut_m3, left_m3, own, common, rounding = (np.zeros(shape) for _ in range(5))
     level = np.where(built.floor, built.design_h, np.nan)
+    level_of = np.nanmax(np.where(built.floor, level, -np.inf), axis=1)
     depth_m = np.where(built.cut, ground_h - built.h, np.nan)
     rounded = cell / np.sqrt(12.0)
     for side, sign in ((0, -1.0), (1, 1.0)):
         outward = sign * grid.offset
         # The floor's own cells and those that lie no higher than it: up a slope cells end where the slope does.
-        low = built.cut & (
-            built.h < np.nanmax(np.where(built.floor, level, -np.inf), axis=1)[:, None] + LOW_M
-        )
+        low = built.cut & (built.h < level_of[:, None] + LOW_M)
         low &= (outward > 0)[None, :]
         reach = np.where(low, outward[None, :], -np.inf)
         last = np.argmax(reach, axis=1)
@@ -248,7 +252,9 @@ def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
         rows, depth = rows[keep], depth[keep]
         counted = outward[last[rows]] + 0.5 * cell
         border = sides.border[rows, side]
-        reached = border + sides.outward[rows, side]
+        # The side is told at the floor's level, along the designed slope. Here it counts where the edge was in plan:
+        # an error of height would else move both sides, and did, twice as far as the common sigma says.
+        reached = border + sides.in_plan.outward[rows, side]
         told = np.abs(reached - counted) <= 2 * cell
         strip = np.where(told, reached - counted, 0.0)
         cut_m3[rows, side] = strip * cell * depth
@@ -258,8 +264,8 @@ def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
         beside = np.argmin(outer, axis=1)
         sloped = np.isfinite(outer.min(axis=1)) & np.isfinite(built.design_h[rows, beside])
         left_m3[rows, side] = -(within + np.where(sloped, strip - within, 0.0)) * cell * depth
-        own[rows, side] = np.where(told, sides.own[rows, side], 0.0) * cell * depth
-        common[rows, side] = np.where(told, sign * sides.common[rows, side], 0.0) * cell * depth
+        own[rows, side] = np.where(told, sides.in_plan.own[rows, side], 0.0) * cell * depth
+        common[rows, side] = np.where(told, sign * sides.in_plan.common[rows, side], 0.0) * cell * depth
         rounding[rows, side] = np.where(told, 0.0, rounded) * cell * depth
     end = np.zeros(grid.rows)
     filled = np.flatnonzero(np.isfinite(depth_m).any(axis=1))
@@ -267,7 +273,7 @@ def _strips(built: AsBuilt, ground_h: np.ndarray, sides: SideRows) -> _Strips:
         along = np.hypot(rounded, np.nanmedian(sides.common) if np.isfinite(sides.common).any() else 0.0)
         for row in (filled[0], filled[-1]):
             end[row] = along * cell * float(np.nansum(np.maximum(depth_m[row], 0.0)))
-    return _Strips(cut_m3, left_m3, own, common, rounding, sides.time_ns, end)
+    return _Strips(cut_m3, left_m3, own, common, rounding, sides.in_plan.time_ns, end)
 
 
 @dataclass(frozen=True)
@@ -311,12 +317,13 @@ def _one_sided(
     def total(cells_m: np.ndarray | float, mean_m: float) -> float:
         return float(_positive_part(deviation + cells_m, own, spread.moved(mean_m))[0].sum())
 
-    value, sd = _positive_part(deviation, own, spread)
+    sd = _positive_part(deviation, own, spread)[1]
     of_cells = float(np.sqrt(np.sum(sweeps_of(sd, when) ** 2)))
     of_mean = 0.5 * (total(0.0, spread.sigma_mean) - total(0.0, -spread.sigma_mean))
     shift = float(common.mean())
-    of_common = 0.5 * (total(common, shift) - total(-common, -shift))
-    return float(value.sum()), float(np.hypot(of_cells, of_mean)), of_common
+    moved = np.array([total(draw * common, draw * shift) for draw in _DRAWS])
+    mean = float(_WEIGHTS @ moved)
+    return mean, float(np.hypot(of_cells, of_mean)), float(np.sqrt(_WEIGHTS @ (moved - mean) ** 2))
 
 
 def _positive_part(deviation: np.ndarray, own: np.ndarray, spread: _Spread) -> tuple[np.ndarray, np.ndarray]:

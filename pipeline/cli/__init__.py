@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pipeline import __version__
+from pipeline.cli.calibrate import calibrate
 from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
 
 if TYPE_CHECKING:
@@ -63,6 +64,9 @@ RUNS = click.option(
 @click.version_option(__version__, prog_name="gradetrace")
 def main() -> None:
     """Turn the log of an excavator's cameras into poses and a trench report."""
+
+
+main.add_command(calibrate)
 
 
 @main.command()

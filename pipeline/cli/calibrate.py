@@ -1,0 +1,10 @@
+"""The commands that calibrate: ``gradetrace calibrate ...``."""
+
+from __future__ import annotations
+
+import click
+
+
+@click.group()
+def calibrate() -> None:
+    """Tell cameras, mounts, joints and the bucket from logs made for it, and write them into machine.toml."""
