@@ -1,10 +1,10 @@
 """As-built cells, verdicts, volumes and sides of many drawn trenches against their truth: `make bench-trenches`.
 
 Trenches are dug by a drawn operator (`_drawn_trenches`) and surveyed with drawn errors of the stated covariance; the
-truth is what the same edge leaves without errors. Bars: errors of cells over their sigma 0.9 to 1.1 RMS and no bias
-above 0.2 sigma, while the plain lowest pass is biased by more; of the stations called PASS fewer than 5 % are truly
-outside, of those called FAIL fewer than 5 % truly inside; errors of volumes and of sides within their sigma (RMS at
-most 1.1). Runs on every core.
+truth is what the same edge leaves without errors. Bars: errors of cells and of stations over their sigma 0.9 to 1.1
+RMS, no bias above 0.2 sigma, while the plain lowest pass is biased by more; of stations called PASS fewer than 5 % are
+truly outside, of those called FAIL fewer than 5 % truly inside; errors of volumes and of sides within their sigma (RMS
+at most 1.1). Runs on every core.
 """
 
 from __future__ import annotations
@@ -52,6 +52,8 @@ class Errors:
     cells: np.ndarray
     plain: np.ndarray
     """Of cells without the correction of the lowest pass."""
+    stations: np.ndarray
+    """Of deviations over their sigmas; less the common error, over their own part: (2, n)."""
     passed_wrong: int
     passed: int
     failed_wrong: int
@@ -82,12 +84,17 @@ def errors_of(seed: int) -> Errors:
     known = np.isfinite(true.stations.deviation)
     passed = known & (found.stations.verdict == PASS)
     failed = known & (found.stations.verdict == FAIL)
+    off = found.stations.deviation - true.stations.deviation
+    told = np.isfinite(off)
+    raised = (drawn.measured.p_grid - drawn.truth.p_grid)[:, 1, 2].mean()
+    own, common = found.stations.sigma_own[told], found.stations.sigma_common[told]
     across = (found.sides.outward - true.sides.outward) / np.hypot(
         found.sides.sigma_own, found.sides.sigma_common
     )
     return Errors(
         cells=_cells(found.built, true.built),
         plain=_cells(plain.built, true.built),
+        stations=np.stack([off[told] / np.hypot(own, common), (off[told] - raised) / own]),
         passed_wrong=int(np.count_nonzero(passed & ~inside)),
         passed=int(np.count_nonzero(passed)),
         failed_wrong=int(np.count_nonzero(failed & inside)),
@@ -130,9 +137,13 @@ def main() -> int:
         sum(one.failed_wrong for one in drawn),
     )
     of_volumes = np.sqrt(np.mean([one.volumes**2 for one in drawn], axis=0))
+    of_stations, of_own = np.sqrt(np.mean([np.mean(one.stations**2, axis=1) for one in drawn], axis=0))
     of_sides = float(np.sqrt(np.mean(np.concatenate([one.sides for one in drawn]) ** 2)))
     print(
         f"cells: error over sigma {rms:.2f} RMS, bias {bias:+.2f}; without the correction bias {plain:+.2f}"
+    )
+    print(
+        f"stations: error over sigma {of_stations:.2f} RMS; without the common error over the own part {of_own:.2f}"
     )
     print(f"PASS {passed}, truly outside {passed_wrong}; FAIL {failed}, truly inside {failed_wrong}")
     for kind, value in zip(KINDS, of_volumes):
@@ -140,11 +151,13 @@ def main() -> int:
     print(f"sides: error over sigma {of_sides:.2f} RMS")
     line = (
         f"trenches: {count} drawn; cells {rms:.2f} of sigma, bias {bias:+.2f} (plain {plain:+.2f}); "
+        f"stations {of_stations:.2f}, own part {of_own:.2f}; "
         f"PASS {passed_wrong} of {passed} wrong, FAIL {failed_wrong} of {failed}; "
         f"volumes {', '.join(f'{kind} {value:.2f}' for kind, value in zip(KINDS, of_volumes))}; sides {of_sides:.2f}"
     )
     row = {
         "trenches": count, "cells_rms": rms, "cells_bias": bias, "plain_bias": plain,
+        "stations_rms": float(of_stations), "stations_own_rms": float(of_own),
         "passed": passed, "passed_wrong": passed_wrong, "failed": failed, "failed_wrong": failed_wrong,
         **{f"volume {kind}": float(value) for kind, value in zip(KINDS, of_volumes)}, "sides_rms": of_sides,
     }  # fmt: skip
@@ -154,6 +167,7 @@ def main() -> int:
         what
         for what, bad in (
             ("cells", not CELLS_BAR[0] <= rms <= CELLS_BAR[1]),
+            ("stations", not CELLS_BAR[0] <= of_stations <= CELLS_BAR[1]),
             ("bias", abs(bias) > BIAS_BAR),
             ("plain", abs(plain) <= BIAS_BAR),
             ("PASS", passed_wrong >= WRONG_BAR * passed),

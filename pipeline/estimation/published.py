@@ -171,9 +171,10 @@ class _Edge:
             : part.epochs
         ]
         rows = np.arange(here.start, here.stop)
-        self.variances.append(vertical_budget(track, found.P_zz, self.groups, rows))
+        variances = vertical_budget(track, found.P_zz, self.groups, rows)
+        self.variances.append(variances)
         self.lasting.add(track, found, part.start, part.epochs)
-        self.sensitivities.add(track, found, part.start, rows)
+        self.sensitivities.add(track, found, part.start, rows, variances)
 
     def told(self) -> tuple[dict, dict, dict]:
         back = self.variances[::-1]

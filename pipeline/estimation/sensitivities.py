@@ -27,6 +27,8 @@ LEFT_OUT = 1e-3
 """Share of the common variance of a part of the log that may stay outside the plane; the reader counts it as own."""
 MOST_FACTORS = 40
 WEAR, SENSOR, CLOCK, BENCHMARK, COMMON = "wear", "sensor", "time offset", "benchmark", "common"
+BUDGET = "budget"
+"""Not a value that may be wrong, but how much of the common error in elevation comes from one group of them."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +36,13 @@ class Source:
     """One value of the files, or one factor of the common error."""
 
     kind: str
-    """wear, sensor, time offset, benchmark, or common."""
+    """wear, sensor, time offset, benchmark, common, or budget."""
     name: str
-    """Of the sensor or the benchmark; the number of the factor."""
+    """Of the sensor or the benchmark; the number of the factor; the group of the error budget."""
     component: str
     """Easting, northing or elevation of a benchmark: e, n, h."""
     unit: str
-    """Of the value: m, deg or s; of a factor: sigma."""
+    """Of the value: m, deg or s; of a factor or a part of the budget: sigma."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +54,13 @@ class Sensitivities:
     sources: tuple[Source, ...]
     response: np.ndarray
     """(n, len(sources), 6) float32: shift of the edge's middle along e n h, and turn about these axes; metres and
-    radians per unit of the source. Of a factor: per standard deviation; they are independent."""
+    radians per unit of the source. Of a factor: per standard deviation; they are independent. Of a part of the budget:
+    its standard deviation of the elevation, and nothing else."""
+
+    @property
+    def causes(self) -> list[int]:
+        """Sources that are values of the files."""
+        return [k for k, s in enumerate(self.sources) if s.kind not in (COMMON, BUDGET)]
 
     def portions(self, epochs: int) -> Iterator[Sensitivities]:
         """So many epochs at a time."""
@@ -68,18 +76,35 @@ class Gathered:
         self.problem = problem
         self.sources, self.moves = _sources(problem)
         self.lever = 0.5 * width_m
+        self.budgets: list[np.ndarray] = []
+        self.groups: tuple[str, ...] = ()
         self.plane: np.ndarray | None = None
         self.time_ns: list[np.ndarray] = []
         self.causes: list[np.ndarray] = []
         self.factors: list[np.ndarray] = []
 
-    def add(self, track: BodyTrack, found: Marginals, start: int, rows: np.ndarray) -> None:
-        """A part's track of the tool and its marginals; ``rows`` of it are published, ``start`` is its first epoch."""
+    def add(
+        self,
+        track: BodyTrack,
+        found: Marginals,
+        start: int,
+        rows: np.ndarray,
+        variances: dict[str, np.ndarray],
+    ) -> None:
+        """A part's track of the tool and its marginals; ``rows`` of it are published, ``start`` is its first epoch.
+
+        ``variances`` are those of ``marginals.vertical_budget`` at these rows.
+        """
         time_s = self.problem.epochs.time_s
         bins = np.floor(time_s / STEP_S).astype(np.int64)
-        rows = rows[(start + rows == 0) | (bins[start + rows] != bins[np.maximum(start + rows - 1, 0)])]
+        kept = (start + rows == 0) | (bins[start + rows] != bins[np.maximum(start + rows - 1, 0)])
+        rows = rows[kept]
         if len(rows) == 0:
             return
+        self.groups = tuple(name for name in variances if name != "own")
+        budget = np.zeros((len(rows), len(self.groups), 6), np.float32)
+        budget[:, :, 2] = np.sqrt(np.stack([variances[name][kept] for name in self.groups], axis=1))
+        self.budgets.append(budget)
         R = track.T_world_body[rows, :3, :3]
         M = track.M[rows]
         M = np.concatenate([R @ M[:, :3], R @ M[:, 3:]], axis=1)
@@ -119,11 +144,27 @@ class Gathered:
         assert self.plane is not None
         count = self.plane.shape[1]
         factors = [np.pad(f, ((0, 0), (0, count - f.shape[1]), (0, 0))) for f in self.factors[::-1]]
+        budgets = self.budgets[::-1]
+        # Where the files are exact there is nothing to share out.
+        some = any(bool(part.any()) for part in budgets)
+        groups = self.groups if some else ()
         names = tuple(Source(COMMON, str(i + 1), "", "sigma") for i in range(count))
         return Sensitivities(
             np.concatenate(self.time_ns[::-1]),
-            (Source(WEAR, "", "", "m"), *self.sources, *names),
-            np.concatenate([np.concatenate(self.causes[::-1]), np.concatenate(factors)], axis=1),
+            (
+                Source(WEAR, "", "", "m"),
+                *self.sources,
+                *names,
+                *(Source(BUDGET, name, "h", "sigma") for name in groups),
+            ),
+            np.concatenate(
+                [
+                    np.concatenate(self.causes[::-1]),
+                    np.concatenate(factors),
+                    np.concatenate(budgets)[:, : len(groups)],
+                ],
+                axis=1,
+            ),
         )
 
 

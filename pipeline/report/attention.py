@@ -215,13 +215,17 @@ def _of_causes(inputs: ReportInputs, units: Units, words: Words) -> list[Remark]
     return [Remark(GRAVE, sentence, "checks")]
 
 
+def no_statistics(inputs: ReportInputs, words: Words) -> str:
+    """Why there are no statistics of floor shots: no shot at all could be compared, or only other kinds."""
+    checks = inputs.table("checks")
+    others = checks is not None and bool(counted(checks, None).any())
+    return words("attention.no_floor_checks" if others else "attention.no_checks")
+
+
 def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number] | None) -> list[Remark]:
     checks = inputs.table("checks")
     if statistics is None or checks is None:
-        others = checks is not None and bool(counted(checks, None).any())
-        remarks = [
-            Remark(SERIOUS, words("attention.no_floor_checks" if others else "attention.no_checks"), "checks")
-        ]
+        remarks = [Remark(SERIOUS, no_statistics(inputs, words), "checks")]
     else:
         remarks = []
     if checks is None:

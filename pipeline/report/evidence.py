@@ -288,6 +288,33 @@ def error_budget(inputs: ReportInputs, units: Units, words: Words) -> dict[str, 
     return numbers.table(columns, rows)
 
 
+def budget_by_station(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any] | None:
+    """Each station's common error in elevation by source: where a better survey or calibration would help there."""
+    found = inputs.table("station_budgets")
+    if found is None or len(found["station"]) == 0:
+        return None
+    sources = list(dict.fromkeys(found["source"].tolist()))
+    sigma = found["sigma"].reshape(-1, len(sources))
+    shown = [k for k in range(len(sources)) if np.any(sigma[:, k] > 0)]
+    columns = [
+        column("station", words("columns.station"), units.length, units.station_digits),
+        *(
+            column(
+                sources[k],
+                words(f"sources.{sources[k]}") if words.has(f"sources.{sources[k]}") else sources[k],
+                units.deviation,
+                units.fine_digits,
+            )
+            for k in shown
+        ),
+    ]
+    rows = [
+        {"station": units.to_length(station)} | {sources[k]: units.to_deviation(sigma[i, k]) for k in shown}
+        for i, station in enumerate(found["station"][:: len(sources)])
+    ]
+    return numbers.table(columns, rows)
+
+
 def budget_by_class(inputs: ReportInputs, units: Units, words: Words) -> dict[str, Any] | None:
     """The same by what the machine was doing: a row per class of epochs with its sigma and that of each source.
 

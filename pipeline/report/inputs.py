@@ -65,8 +65,8 @@ class ReportInputs:
     utilities: tuple[Buried, ...] = ()
     """What is buried, to draw it."""
     tables: Mapping[str, Table] = field(default_factory=dict)
-    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, sides, volumes, checks,
-    utilities."""
+    """By table name: frames, sensors, residuals, statics, cutting_edge, as_built, stations, station_budgets, sides,
+    volumes, checks, utilities."""
     detections: Mapping[str, Table] = field(default_factory=dict)
     """By camera; columns time_ns, tag_id and status."""
     moments: Sequence[Moment] = ()

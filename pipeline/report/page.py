@@ -28,7 +28,7 @@ from pipeline.report import (
     utilities,
     views,
 )
-from pipeline.report.attention import attention
+from pipeline.report.attention import attention, no_statistics
 from pipeline.report.consistency import consistency
 from pipeline.report.drawing import house_style, svg_of
 from pipeline.report.evidence import Timeline
@@ -102,9 +102,11 @@ def compose(inputs: ReportInputs, units: Units, words: Words) -> tuple[dict[str,
         "diagnosis": causes.diagnosis(inputs, units, words),
         "utilities": utilities.section(inputs, units, words),
         "check_statistics": _labelled_statistics(statistics, words),
+        "no_statistics": "" if statistics is not None else no_statistics(inputs, words),
         "indicative": statistics is not None and statistics["n"]["value"] < ENOUGH,
         "error_budget": evidence.error_budget(inputs, units, words),
         "error_budget_by_class": evidence.budget_by_class(inputs, units, words),
+        "error_budget_by_station": evidence.budget_by_station(inputs, units, words),
         "coverage": evidence.coverage(inputs, words),
         "detector": {"rejected": detector.rejected(inputs, words), **detector.scatter(inputs, words)},
         "quality": evidence.quality(inputs, words),

@@ -145,7 +145,7 @@ STAGES = (
     Stage("detect", 7, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        17,
+        18,
         "adjusting the network",
         ("ingest", "detect"),
         (),
@@ -159,12 +159,12 @@ STAGES = (
         "as-built against design",
         ("estimate", "track"),
         ("design", "ground", "checks", "utilities"),
-        ("as_built", "stations", "sides", "volumes", "checks", "utilities"),
+        ("as_built", "stations", "station_budgets", "sides", "volumes", "checks", "utilities"),
         _surveying,
     ),
     Stage(
         "report",
-        4,
+        5,
         "writing the report",
         ("ingest", "detect", "estimate", "track", "survey"),
         ("log", "design", "checks", "utilities"),

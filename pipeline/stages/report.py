@@ -29,6 +29,7 @@ COLUMNS: dict[str, list[str] | None] = {
     "cutting_edge": ["time_ns", "point", "e", "n", "h", "seen"],
     "as_built": None,
     "stations": None,
+    "station_budgets": None,
     "sides": None,
     "volumes": None,
     "checks": None,

@@ -73,6 +73,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.site import Tolerance
+from pipeline.estimation.table import sensitivities_from_columns
 from pipeline.stages import check_shots
 from pipeline.stages.job import Counts, Job, Progress
 from pipeline.surface import table
@@ -95,6 +96,7 @@ from pipeline.surface.decision import (
 from pipeline.surface.design import TinDesign, floor_sentence, read_design
 from pipeline.surface.ground import read_ground
 from pipeline.surface.sides import sides
+from pipeline.surface.station_budget import station_budget
 from pipeline.surface.sweep import path_along
 from pipeline.surface.utilities import REACH_M, VERDICTS, facts_of, find_approaches, read_utilities
 from pipeline.surface.volumes import Volume, volumes
@@ -107,7 +109,7 @@ SIGMA_SHOT_M = 0.002
 
 
 def run(job: Job, progress: Progress) -> Counts:
-    """Write `as_built`, `stations`, `sides`, `volumes`, `checks`, `utilities` and `survey.json`.
+    """Write `as_built`, `stations`, `station_budgets`, `sides`, `volumes`, `checks`, `utilities` and `survey.json`.
 
     Raises SurfaceError for a design, an alignment, check shots or utilities that cannot be used.
     """
@@ -149,6 +151,9 @@ def run(job: Job, progress: Progress) -> Counts:
 
     job.write_table("as_built", table.columns_of_as_built(built, NULL_INT))
     job.write_table("stations", table.columns_of_stations(stations))
+    answer = sensitivities_from_columns(job.read_table("sensitivities"))
+    budget = station_budget(built, answer, where, step_m)
+    job.write_table("station_budgets", table.columns_of_station_budgets(budget))
     job.write_table("sides", table.columns_of_sides(both_sides, judged))
     job.write_table("volumes", table.columns_of_volumes(soil))
     checks: dict[str, Any] | None = None

@@ -84,6 +84,8 @@ class AsBuilt:
     """Own part of the standard deviation of `h`, metres; nan unless cut."""
     sigma_common: np.ndarray
     """Common part."""
+    sigma_pass: np.ndarray
+    """Own part of the pass that is the lowest, metres; nan unless cut. Several passes are surer than it."""
     passes: np.ndarray
     """int32: passes at any height."""
     lowest_time_ns: np.ndarray
@@ -164,6 +166,7 @@ def as_built(
     of_pass = np.maximum(chosen.lowest_pass, 0)
     no_pass = len(passes.height) == 0
     common = np.full(grid.size, np.nan) if no_pass else passes.sigma_common[of_pass]
+    of_one = np.full(grid.size, np.nan) if no_pass else passes.sigma_own[of_pass]
     when = np.zeros(grid.size, np.int64) if no_pass else passes.time_ns[of_pass]
     lowest = np.where(np.isfinite(passes.lowest), passes.lowest, np.nan)
     return AsBuilt(
@@ -175,6 +178,7 @@ def as_built(
         design_h=design_h,
         sigma_own=np.where(cut, chosen.sigma_own.reshape(shape), np.nan),
         sigma_common=np.where(cut, common.reshape(shape), np.nan),
+        sigma_pass=np.where(cut, of_one.reshape(shape), np.nan),
         passes=passes.crossed.reshape(shape),
         lowest_time_ns=np.where(
             kept, when.reshape(shape), np.where(state > 0, passes.lowest_time_ns.reshape(shape), 0)

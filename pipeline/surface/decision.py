@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
 from pipeline.surface.sides import SIDES, Sides
-from pipeline.surface.sweep import sweeps_of
+from pipeline.surface.sweep import sigma_of_sum
 
 PASS, FAIL, CANNOT_TELL, NOT_REACHED = "PASS", "FAIL", "CANNOT TELL", "NOT REACHED"
 CUT, PARTLY, UNREACHED = "cut", "partly cut", "not reached"
@@ -208,7 +208,9 @@ def judge(
                 + (f"; {touched - cells_cut[i]} more were passed over" if touched > cells_cut[i] else "")
             )
             continue
-        own = _sigma_own_of_mean(built.sigma_own[rows][cut], built.lowest_time_ns[rows][cut])
+        own = sigma_of_sum(
+            built.sigma_own[rows][cut], built.sigma_pass[rows][cut], built.lowest_time_ns[rows][cut]
+        ) / np.count_nonzero(cut)
         common = float(np.mean(built.sigma_common[rows][cut]))
         uncertainty = band.coverage_factor * float(np.hypot(own, common))
         deviation = float(np.mean(built.deviation[rows][cut]))
@@ -328,8 +330,3 @@ def _floor_cells(design: Design, station: np.ndarray, step_m: float, cell_m: flo
     length = np.minimum(station + 0.5 * step_m, last) - np.maximum(station - 0.5 * step_m, first)
     on_floor = design.is_floor(station[:, None], across[None, :])
     return np.floor(np.count_nonzero(on_floor, axis=1) * np.maximum(length, 0.0) / cell_m + 1e-6).astype(int)
-
-
-def _sigma_own_of_mean(sigma: np.ndarray, time_ns: np.ndarray) -> float:
-    """Own sigma of the mean of cells."""
-    return float(np.sqrt(np.sum((sweeps_of(sigma, time_ns) / len(sigma)) ** 2)))

@@ -143,7 +143,7 @@ def _of_known_points(shots: Shots, at: np.ndarray, u: np.ndarray, sigma_ts: np.n
 
 def causes_of(answer: Sensitivities | None, in_plan: bool) -> tuple[Cause, ...]:
     """Every cause that can show: those of the files, and the datum in elevation and, with shots in plan, in plan."""
-    sources = () if answer is None else tuple(s for s in answer.sources if s.kind != COMMON)
+    sources = () if answer is None else tuple(answer.sources[k] for k in answer.causes)
     causes = [Cause(s.kind, s.name, s.component, s.unit) for s in sources]
     return (*causes, *(Cause(DATUM, "", axis, "m") for axis in ("enh" if in_plan else "h")))
 
@@ -169,8 +169,7 @@ def signature_of(
     columns = []
     if answer is not None and moved is not None:
         # Were the file's value larger by as much as the true one is, ours would move, and the difference go.
-        sources = [k for k, s in enumerate(answer.sources) if s.kind != COMMON]
-        columns = list(-np.einsum("mj,mkj->mk", axis, moved[:, sources]).T)
+        columns = list(-np.einsum("mj,mkj->mk", axis, moved[:, answer.causes]).T)
     columns += [heading[:, "enh".index(c.component)] for c in causes if c.kind == DATUM]
     return np.column_stack(columns)
 
@@ -191,11 +190,11 @@ def response_at(
     p_grid : (m, 3) array
         Where, grid metres.
     """
-    before, share = _between(answer.time_ns, time_ns)
+    before, share = between(answer.time_ns, time_ns)
     after = np.minimum(before + 1, len(answer.time_ns) - 1)
     s = share[:, None, None]
     moved = (1.0 - s) * answer.response[before] + s * answer.response[after]
-    before, share = _between(edge.time_ns, time_ns)
+    before, share = between(edge.time_ns, time_ns)
     after = np.minimum(before + 1, len(edge) - 1)
     middle = (1.0 - share[:, None]) * edge.p_grid[before, 1] + share[:, None] * edge.p_grid[after, 1]
     lever = (p_grid - middle)[:, None, :]
@@ -222,8 +221,8 @@ def _axes(shots: Shots, comparison: Comparison, alignment: Alignment, i: int) ->
     return [np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0]), up]
 
 
-def _between(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The entry before each time and the share of the way to the next one, held at both ends."""
+def between(times: np.ndarray, wanted: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The entry before each time (of ascending ones) and the share of the way to the next one, held at both ends."""
     k = np.clip(np.searchsorted(times, wanted, side="right") - 1, 0, max(len(times) - 2, 0))
     if len(times) < 2:
         return k, np.zeros(len(wanted))

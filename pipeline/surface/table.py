@@ -11,6 +11,7 @@ from pipeline.surface.checks import Comparison
 from pipeline.surface.decision import SideVerdicts, Stations
 from pipeline.surface.shots import Shots
 from pipeline.surface.sides import SIDES, Sides
+from pipeline.surface.station_budget import StationBudget
 from pipeline.surface.utilities import Finding, verdict_of
 from pipeline.surface.volumes import Volumes
 
@@ -57,7 +58,19 @@ def columns_of_sides(sides: Sides, judged: SideVerdicts | None) -> Columns:
     return {
         "station": np.repeat(sides.station, 2),
         "side": np.tile(np.array(SIDES, object), len(sides.station)),
+        "design_width": np.repeat(sides.design_width, 2),
         **{name: values.ravel() for name, values in (found | said).items()},
+    }
+
+
+def columns_of_station_budgets(budget: StationBudget) -> Columns:
+    """Columns of the ``station_budgets`` table: the sources of each station that was reached."""
+    told = np.flatnonzero(np.isfinite(budget.sigma).all(axis=1)) if budget.sources else np.zeros(0, np.int64)
+    count = len(budget.sources)
+    return {
+        "station": np.repeat(budget.station[told], count),
+        "source": np.tile(np.array(budget.sources, object), len(told)),
+        "sigma": budget.sigma[told].ravel(),
     }
 
 

@@ -28,7 +28,7 @@ from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
 from pipeline.surface.ground import Ground
 from pipeline.surface.sides import LOW_M, SideRows
-from pipeline.surface.sweep import sweeps_of
+from pipeline.surface.sweep import sigma_of_sum, sweeps_of
 
 CUT, LEFT, OVER = "cut", "left to cut", "over-dug"
 KINDS = (CUT, LEFT, OVER)
@@ -127,9 +127,11 @@ def volumes(
         dug = cut & np.isfinite(built.design_h[rows])
         when = built.lowest_time_ns[rows]
         own, common = built.sigma_own[rows], built.sigma_common[rows]
+        one_pass = built.sigma_pass[rows]
         deviation = built.deviation[rows]
-        over = _one_sided(-deviation[dug], own[dug], common[dug], when[dug], spread.mirrored)
-        high = _one_sided(deviation[dug], own[dug], common[dug], when[dug], spread)
+        errors = own[dug], common[dug], one_pass[dug], when[dug]
+        over = _one_sided(-deviation[dug], *errors, spread.mirrored)
+        high = _one_sided(deviation[dug], *errors, spread)
         low_cells, high_cells = (np.count_nonzero(part) for part in (deviation[dug] < 0, deviation[dug] > 0))
         over_dug = Volume(OVER, over[0] * area, over[1] * area, over[2] * area, low_cells * area)
         if ground is None:
@@ -141,7 +143,7 @@ def volumes(
             )
         known = cut & np.isfinite(ground_h[rows])
         depth = np.maximum(ground_h[rows] - built.h[rows], 0.0)[known]
-        own_cut = np.sqrt(np.sum(sweeps_of(own[known], when[known]) ** 2)) * area
+        own_cut = sigma_of_sum(own[known], one_pass[known], when[known]) * area
         common_cut = np.hypot(common[known].sum(), sigma_ground * np.count_nonzero(known)) * area
         soil = untouched[rows]
         soil_m2 = np.count_nonzero(soil) * area + elsewhere_m2
@@ -299,16 +301,20 @@ def _spread(built: AsBuilt) -> _Spread:
     if not np.any(dug):
         return _Spread(0.0, 0.0, 0.0)
     deviation, own = built.deviation[dug], built.sigma_own[dug]
-    sweeps = sweeps_of(own, built.lowest_time_ns[dug])
     return _Spread(
         mean=float(deviation.mean()),
         variance=max(float(deviation.var() - np.mean(own**2)), 0.0),
-        sigma_mean=float(np.sqrt(np.sum(sweeps**2))) / len(own),
+        sigma_mean=sigma_of_sum(own, built.sigma_pass[dug], built.lowest_time_ns[dug]) / len(own),
     )
 
 
 def _one_sided(
-    deviation: np.ndarray, own: np.ndarray, common: np.ndarray, when: np.ndarray, spread: _Spread
+    deviation: np.ndarray,
+    own: np.ndarray,
+    common: np.ndarray,
+    one_pass: np.ndarray,
+    when: np.ndarray,
+    spread: _Spread,
 ) -> tuple[float, float, float]:
     """Sum over cells of the positive part of their true deviations, with its own and its common sigma; metres."""
     if not len(deviation):
@@ -318,7 +324,7 @@ def _one_sided(
         return float(_positive_part(deviation + cells_m, own, spread.moved(mean_m))[0].sum())
 
     sd = _positive_part(deviation, own, spread)[1]
-    of_cells = float(np.sqrt(np.sum(sweeps_of(sd, when) ** 2)))
+    of_cells = sigma_of_sum(sd, sd * one_pass / np.maximum(own, 1e-12), when)
     of_mean = 0.5 * (total(0.0, spread.sigma_mean) - total(0.0, -spread.sigma_mean))
     shift = float(common.mean())
     moved = np.array([total(draw * common, draw * shift) for draw in _DRAWS])

@@ -20,7 +20,11 @@ def test_only_what_is_set_changes():
         text,
         "machine.toml",
         {
-            "cameras.arm.mount": {"xyz_m": [0.7, 0.9, 2.3], "rpy_deg": [-96.0, 0.5, -94.0], "covariance": covariance},
+            "cameras.arm.mount": {
+                "xyz_m": [0.7, 0.9, 2.3],
+                "rpy_deg": [-96.0, 0.5, -94.0],
+                "covariance": covariance,
+            },
             "cameras.arm.intrinsics.fx": 851.25,
             "sensors.bucket-pot.time_offset_s": np.float64(0.02),
         },

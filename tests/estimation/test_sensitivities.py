@@ -106,6 +106,12 @@ def test_the_factors_give_the_common_covariance_of_two_instants():
     factors = told.response[:, [s.kind == "common" for s in told.sources], :3].astype(float)
     ours = np.einsum("kra,lrb->kalb", factors, factors)
     n = len(at)
+    # The parts of the budget add up to the variance of the elevation, and move nothing else.
+    budget = told.response[:, [s.kind == "budget" for s in told.sources]].astype(float)
+    parts = np.sum(budget[:, :, 2] ** 2, axis=1)
+    np.testing.assert_allclose(parts, np.einsum("kckc->kc", whole)[:, 2], rtol=1e-5)
+    assert not budget[..., [0, 1, 3, 4, 5]].any()
+    assert {s.name for s in told.sources if s.kind == "budget"} >= {"benchmarks", "mounts", "cutting edge"}
     whole, ours = whole.reshape(3 * n, 3 * n), ours.reshape(3 * n, 3 * n)
     print(f"{factors.shape[1]} factors of {len(found.P_zz)} unknowns")
     assert factors.shape[1] < 0.5 * len(found.P_zz)

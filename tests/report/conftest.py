@@ -157,6 +157,7 @@ def sides_and_volumes(stations):
     sides = {
         "station": np.repeat(stations["station"], 2),
         "side": np.tile(np.array(["left", "right"], object), n),
+        "design_width": np.full(2 * n, 1.2),
         "outward": outward.ravel(),
         "sigma_own": np.where(known, 0.004, np.nan).ravel(),
         "sigma_common": np.where(known, 0.003, np.nan).ravel(),
@@ -359,6 +360,11 @@ def made_up_inputs(unit="m", seed=7):
             "cutting_edge": edge,
             "as_built": as_built_table(rng, stations),
             "stations": stations,
+            "station_budgets": {
+                "station": np.repeat(stations["station"][:33], 3),
+                "source": np.tile(np.array(["benchmarks", "mounts", "time offset"], object), 33),
+                "sigma": np.tile([0.0036, 0.0027, 0.0], 33),
+            },
             "sides": sides,
             "volumes": volumes,
             "checks": checks_table(rng),

@@ -375,3 +375,40 @@ def test_every_table_of_the_new_sections_is_held_against_report_json(read):
         "evidence.views.1.tags",
     } <= set(read.tables)
     assert {"coverage.idle_total", "coverage.idle_count"} <= set(read.numbers)
+
+
+def test_a_station_that_fails_by_a_side_alone_is_told_with_the_side():
+    inputs = made_up_inputs()
+    stations = inputs.tables["stations"]
+    stations["verdict"][:] = "PASS"
+    stations["deviation"][:] = 0.001
+    stations["verdict"][4], stations["reason"][4] = "FAIL", "the left side is too wide by at least 12 mm"
+    attention = render(inputs).content["attention"]
+    said = [item["sentence"] for item in attention["items"]]
+    told = [one for one in said if one.startswith("Out of tolerance")]
+    assert len(told) == 1
+    assert told[0].startswith("Out of tolerance: 1 of 36 stations, by a side of the floor; at station 102.25")
+    assert "too wide by at least 12 mm" in told[0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("control", "No shot of the trench floor could be compared"),
+        (None, "No total-station shot stands against"),
+    ],
+)
+def test_without_a_shot_of_the_floor_the_page_says_what_the_accuracy_rests_on(kind, said):
+    inputs = made_up_inputs()
+    checks = inputs.tables["checks"]
+    inputs.survey["checks"]["n"] = 0
+    if kind is None:
+        inputs.tables["checks"] = {name: values[:0] for name, values in checks.items()}
+    else:
+        checks["kind"][:] = kind
+    page = render(inputs)
+    attention = page.content["attention"]
+    sentences = [item["sentence"] for item in attention["items"] + attention["more"]]
+    assert page.content["no_statistics"] in sentences
+    assert page.content["no_statistics"].startswith(said)
+    assert page.content["no_statistics"] in page.html

@@ -81,3 +81,21 @@ def test_where_no_shot_helps_the_page_says_why(open_, partly, said):
     wanted = render(inputs).content["wanted"]
     assert wanted["shots"] is None and said in wanted["sentence"]
     assert ("digging does" in wanted["sentence"]) == (partly > 0)
+
+
+def test_the_width_is_the_designed_one_with_both_sides_and_shares_no_error_across(made):
+    unit, page = made
+    units = units_of(unit, METRES[unit])
+    row = page.content["sides"]["rows"][0]
+    outward = float(np.sum([0.02 * np.sin(100.25), 0.015 * np.cos(100.25)]))
+    assert row["width"] == pytest.approx((1.2 + outward) / METRES[unit], abs=1e-5)
+    assert row["u_width"] == pytest.approx(float(units.to_deviation(2 * 0.004 * np.sqrt(2))), rel=1e-3)
+
+
+def test_each_station_has_its_common_error_by_source_and_what_brings_nothing_is_left_out(made):
+    unit, page = made
+    units = units_of(unit, METRES[unit])
+    table = page.content["error_budget_by_station"]
+    assert [c["key"] for c in table["columns"]] == ["station", "benchmarks", "mounts"]
+    assert len(table["rows"]) == 33
+    assert table["rows"][5]["benchmarks"] == pytest.approx(float(units.to_deviation(0.0036)), rel=1e-3)

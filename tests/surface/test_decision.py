@@ -76,7 +76,7 @@ def test_positive_is_high_and_under_dug():
     assert "over-dug" in decide(-0.1, 0.0, ToleranceBand(0.02, 0.02))[1]
 
 
-def surface(trench, deviation, own=0.0, common=0.0, time_s=0.0, cut=True):
+def surface(trench, deviation, own=0.0, common=0.0, time_s=0.0, cut=True, one_pass=None):
     """A surface over the whole trench of the given deviation, cells of 0.1 m; arguments broadcast to its cells."""
     grid = CellGrid(0.1, 0.0, -0.5, 100, 10)
     shape = (100, 10)
@@ -91,6 +91,7 @@ def surface(trench, deviation, own=0.0, common=0.0, time_s=0.0, cut=True):
         design_h=np.full(shape, 50.0),
         sigma_own=full(own),
         sigma_common=full(common),
+        sigma_pass=full(own if one_pass is None else one_pass),
         passes=cut.astype(np.int32),
         lowest_time_ns=np.broadcast_to(np.round(np.asarray(time_s) * 1e9).astype(np.int64), shape),
         excess_m=np.zeros(0),
@@ -104,6 +105,17 @@ BAND = ToleranceBand(0.02, 0.02)
 def judged(trench, built, step=0.5, band=BAND):
     station = (np.arange(round(10.0 / step)) + 0.5) * step  # whole pieces, none cut short at an end
     return judge(built, trench.design, station, step, band)
+
+
+def test_cells_told_by_the_same_passes_share_their_errors(trench):
+    # Three passes of 6 mm tell every cell to 3.5 mm; each of them is the lowest in a third of the cells. The mean of a
+    # station is the mean of the three: 3.5 mm, not a third of three independent means of 3.5 mm.
+    third = np.arange(1000).reshape(100, 10) % 3 * 10.0
+    built = surface(trench, 0.0, own=0.006 / np.sqrt(3), one_pass=0.006, time_s=third)
+    assert judged(trench, built).sigma_own == pytest.approx(0.006 / np.sqrt(3), rel=2e-3)
+    # One sweep that is everywhere the lowest is no worse than its cells.
+    built = surface(trench, 0.0, own=0.006 / np.sqrt(3), one_pass=0.006)
+    assert judged(trench, built).sigma_own == pytest.approx(0.006 / np.sqrt(3), rel=1e-9)
 
 
 def test_stations_are_the_whole_multiples_of_the_step_that_the_design_reaches(trench):
