@@ -35,7 +35,7 @@ def empty():
     )
 
 
-@pytest.mark.parametrize("make", [made_up_inputs, passing, empty])
+@pytest.mark.parametrize("make", [made_up_inputs, pytest.param(passing, marks=pytest.mark.slow), empty])
 def test_axe_finds_nothing(browser, tmp_path, make):
     found = findings(browser, render(make()).html, tmp_path, SIZE)
     assert found["violations"] == []
@@ -49,6 +49,7 @@ def test_axe_finds_nothing_in_what_is_folded_away(browser, page, tmp_path):
     assert findings(browser, html, tmp_path, SIZE)["violations"] == []
 
 
+@pytest.mark.slow
 def test_axe_would_find_what_is_wrong(browser, page, tmp_path):
     """Pale text, a picture without words, a table head without a scope, a link without a name."""
     html = page.html.replace("--muted: #4d565f", "--muted: #b5bcc4")

@@ -55,7 +55,7 @@ def _bytes(optimum):
     return [a.tobytes() for a in arrays], state
 
 
-@pytest.mark.parametrize("long", [False, True])
+@pytest.mark.parametrize("long", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_stopped_after_any_iteration_it_ends_with_the_same_bytes(long, solved, monkeypatch):
     if long:  # one that is approached by a sample
         for name, value in (("STRETCH", 8), ("SPREAD", 4), ("OF_GROUP", 1)):

@@ -15,6 +15,7 @@ RUNS = 25
 LOG = Options(200, 0.04, 0.04, bucket_marker=True, machine=DRIFTING)
 
 
+@pytest.mark.slow
 def test_drifts_of_drawn_clocks_are_off_by_what_their_covariance_says():
     """25 logs of 8 s, the clock 1 +- 10 ms a second off; the bucket's marker is what tells."""
     errors, edge, told = [], [], []

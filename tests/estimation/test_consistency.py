@@ -8,7 +8,10 @@ from tests.estimation.monte_carlo import band, nees, sample, small
 RUNS = 100
 
 
-@pytest.mark.parametrize("bucket_marker", [False, True], ids=["potentiometer", "bucket marker"])
+@pytest.mark.parametrize(
+    "bucket_marker",
+    [pytest.param(False, id="potentiometer"), pytest.param(True, id="bucket marker", marks=pytest.mark.slow)],
+)
 def test_errors_of_a_hundred_drawn_networks_are_as_large_as_their_covariances_say(bucket_marker):
     found = sample(RUNS, small(bucket_marker))
     low, high = band(RUNS, 3)

@@ -64,6 +64,7 @@ def test_one_picture_is_as_good_as_its_sigma_says():
     assert np.array_equal(white.own, shared.own)
 
 
+@pytest.mark.slow
 def test_intervals_hold_while_nothing_moves_and_errors_come_back():
     """Forty pictures of a machine at rest: lenses have 8 components in each of two cameras.
 

@@ -48,7 +48,21 @@ SCENES = [
 SEEDS = (1, 2, 3)
 
 
-@pytest.mark.parametrize("scene", SCENES, ids=lambda s: f"{s.name}-geared" if s.replaced else s.name)
+LONG = {"two-machines"}
+"""Scenes whose draws take half a minute: left to `make test-all`."""
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        pytest.param(
+            s,
+            id=f"{s.name}-geared" if s.replaced else s.name,
+            marks=[pytest.mark.slow] if s.name in LONG else [],
+        )
+        for s in SCENES
+    ],
+)
 def test_poses_of_every_network_of_the_paper_lie_within_their_covariances(scene):
     whitened = {}
     for seed in SEEDS:

@@ -233,7 +233,9 @@ def rms(off):
 
 
 @pytest.mark.parametrize(
-    ("name", "cameras"), [("test_1", 1), ("test_2", 2), ("test_21", 4), ("test_21", 2)], ids=str
+    ("name", "cameras"),
+    [("test_1", 1), ("test_2", 2), pytest.param("test_21", 4, marks=pytest.mark.slow), ("test_21", 2)],
+    ids=str,
 )
 def test_tags_lie_where_another_solver_has_them_and_reproject_no_worse(real_data, name, cameras):
     """Within 5 mm and 0.5 deg, after fixing the same tag; on test_21's stairs one tag in each flight.
