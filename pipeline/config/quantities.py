@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Collection
+from collections.abc import Collection, Iterator, Mapping
 from typing import Annotated
 
 import numpy as np
@@ -45,6 +45,20 @@ class Calibrated(Section):
     """Of that file."""
     raw_range: tuple[float, float] | None = None
     """Stroke over which a sensor's curve was told, raw unit: beyond it the curve is extrapolated."""
+
+
+def calibrated_in(section: Section, key: str = "") -> Iterator[tuple[str, Calibrated]]:
+    """Every quantity below a section that says when it was told: its dotted key, and where it comes from."""
+    for name in type(section).model_fields:
+        value = getattr(section, name)
+        if isinstance(value, Calibrated):
+            yield key, value
+        elif isinstance(value, Section):
+            yield from calibrated_in(value, f"{key}.{name}" if key else name)
+        elif isinstance(value, Mapping):
+            for inner, item in value.items():
+                if isinstance(item, Section):
+                    yield from calibrated_in(item, f"{key}.{name}.{inner}" if key else f"{name}.{inner}")
 
 
 class Pose(Section):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import datetime
+from collections.abc import Iterator
 from typing import Any
 
+from pipeline.config.quantities import calibrated_in
 from pipeline.report import numbers
 from pipeline.report.facts import deviation_text
 from pipeline.report.inputs import FileSource, ReportInputs
@@ -40,7 +43,7 @@ def method(inputs: ReportInputs, units: Units, words: Words) -> list[str]:
 
 
 def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
-    """Tables of files, stages and versions."""
+    """Tables of files, calibrations, stages and versions."""
     files: list[tuple[str, FileSource]] = [
         ("log", inputs.log),
         ("machine", inputs.machine_file),
@@ -74,6 +77,17 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
                 for kind, source in files
             ],
         ),
+        "calibrations": numbers.table(
+            [
+                column("what", words("columns.what"), kind="id"),
+                column("date", words("columns.date")),
+                column("age", words("columns.age"), words("provenance.days"), 0),
+                column("by", words("columns.by")),
+                column("source", words("columns.calibrated_from"), kind="id"),
+                column("sha256", words("columns.sha256"), kind="code"),
+            ],
+            list(_calibrations(inputs)),
+        ),
         "stages": numbers.table(
             stage_columns,
             [
@@ -85,3 +99,18 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
             version_columns, [{"name": name, "version": version} for name, version in inputs.versions.items()]
         ),
     }
+
+
+def _calibrations(inputs: ReportInputs) -> Iterator[dict[str, Any]]:
+    """A row per quantity of the two files that says when it was told; its age is that on the day of the log."""
+    start_ns = inputs.log_facts.get("start_ns")
+    day = None if not start_ns else datetime.datetime.fromtimestamp(start_ns / 1e9, datetime.UTC).date()
+    for key, told in [*calibrated_in(inputs.machine), *calibrated_in(inputs.site)]:
+        yield {
+            "what": key,
+            "date": told.date.isoformat(),
+            "age": None if day is None else (day - told.date).days,
+            "by": told.by,
+            "source": told.source,
+            "sha256": told.sha256,
+        }

@@ -1,6 +1,7 @@
 """The page is sound HTML, asks for nothing, hides nothing, and its numbers are those of report.json and the tables."""
 
 import dataclasses
+import datetime
 import html
 import json
 import re
@@ -8,6 +9,7 @@ import re
 import numpy as np
 import pytest
 
+from pipeline.config.quantities import Calibrated
 from pipeline.report import palette, render
 from pipeline.report.facts import gaps_of
 from tests.report.conftest import HOSTILE, made_up_inputs
@@ -412,3 +414,19 @@ def test_without_a_shot_of_the_floor_the_page_says_what_the_accuracy_rests_on(ki
     assert page.content["no_statistics"] in sentences
     assert page.content["no_statistics"].startswith(said)
     assert page.content["no_statistics"] in page.html
+
+
+def test_calibrated_quantities_stand_with_their_age_on_the_day_of_the_log():
+    inputs = made_up_inputs()
+    assert render(inputs).content["provenance"]["calibrations"]["rows"] == []
+    day = datetime.datetime.fromtimestamp(inputs.log_facts["start_ns"] / 1e9, datetime.UTC).date()
+    told = Calibrated(
+        date=day - datetime.timedelta(days=17), by="gradetrace calibrate cluster", source="c.mcap"
+    )
+    camera = inputs.machine.cameras["bench"]
+    mount = camera.mount.model_copy(update={"calibrated": told})
+    cameras = inputs.machine.cameras | {"bench": camera.model_copy(update={"mount": mount})}
+    page = render(dataclasses.replace(inputs, machine=inputs.machine.model_copy(update={"cameras": cameras})))
+    (row,) = page.content["provenance"]["calibrations"]["rows"]
+    assert (row["what"], row["age"], row["source"]) == ("cameras.bench.mount", 17, "c.mcap")
+    assert "cameras.bench.mount" in page.html
