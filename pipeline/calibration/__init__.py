@@ -1,0 +1,1 @@
+"""Calibration: what a machine file holds, told from logs made for it."""
