@@ -56,8 +56,11 @@ class CalibrationBoard:
     @property
     def corners_m(self) -> np.ndarray:
         """(n, 3) metres; row by row from the top left, tag by tag in a grid (top-left, top-right, bottom-right,
-        bottom-left of each)."""
-        columns, rows = (self.columns - 1, self.rows - 1) if self.kind == CHARUCO else (self.columns, self.rows)
+        bottom-left of each).
+        """
+        columns, rows = (
+            (self.columns - 1, self.rows - 1) if self.kind == CHARUCO else (self.columns, self.rows)
+        )
         pitch = self.square_m + (self.second_m if self.kind == APRILTAG else 0.0)
         row, column = (part.ravel() for part in np.mgrid[0:rows, 0:columns])
         p = pitch * np.column_stack([column, row, np.zeros(len(row))])

@@ -93,7 +93,9 @@ class CornerFinder:
             return f"no tag of {self.board.family} is in view"
         tags = self.board.columns * self.board.rows // (2 if self.board.kind == CHARUCO else 1)
         first, last = self.board.first_id, self.board.first_id + tags - 1
-        return f"tags {ids[0]} to {ids[-1]} of {self.board.family} are in view, the board has {first} to {last}"
+        return (
+            f"tags {ids[0]} to {ids[-1]} of {self.board.family} are in view, the board has {first} to {last}"
+        )
 
     def _chessboard(self, name: str, grey: np.ndarray) -> View | None:
         size = (self.board.columns, self.board.rows)
@@ -117,7 +119,7 @@ class CornerFinder:
                 self.ids.update(int(tag) for tag in np.ravel(tags))
             if ids is None or not len(ids):
                 continue
-            self._pattern[which].update(np.ravel(ids).tolist())
+            self._pattern[which].update(int(number) for number in np.ravel(ids))
             if best is None or len(ids) > len(best[0]):
                 best = np.ravel(ids), corners.reshape(-1, 2).astype(float)
         if best is None or len(best[0]) < LEAST_CORNERS:
@@ -196,7 +198,7 @@ def _refined(
 
 def _covariance(patch: np.ndarray, at: np.ndarray, w: int, noise: float) -> np.ndarray | None:
     """noise² times the inverse of the gradients' outer products in the window; None of a patch without two edges."""
-    x, y = int(round(at[0])), int(round(at[1]))
+    x, y = round(float(at[0])), round(float(at[1]))
     part = patch[max(y - w - 1, 0) : y + w + 2, max(x - w - 1, 0) : x + w + 2].astype(float)
     if min(part.shape) < 2 * w + 1:
         return None
@@ -204,9 +206,7 @@ def _covariance(patch: np.ndarray, at: np.ndarray, w: int, noise: float) -> np.n
     rows, columns = np.mgrid[0 : part.shape[0], 0 : part.shape[1]]
     r2 = (columns - part.shape[1] // 2) ** 2 + (rows - part.shape[0] // 2) ** 2
     weight = np.exp(-r2 / w**2)
-    G = np.array(
-        [[np.sum(weight * gx * gx), np.sum(weight * gx * gy)], [0.0, np.sum(weight * gy * gy)]]
-    )
+    G = np.array([[np.sum(weight * gx * gx), np.sum(weight * gx * gy)], [0.0, np.sum(weight * gy * gy)]])
     G[1, 0] = G[0, 1]
     if np.linalg.eigvalsh(G)[0] < 25 * noise**2:
         return None

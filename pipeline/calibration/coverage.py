@@ -53,7 +53,9 @@ def coverage(
     Parameters
     ----------
     views : sequence of View
+        Those that are used.
     T_camera_board : (v, 4, 4) array
+        Their poses.
     corners_m : (n, 3) array
         Of the board.
     size : (width, height)

@@ -135,6 +135,7 @@ def solve(
     Parameters
     ----------
     lens : Lens
+        Its model.
     views : sequence of View
         At least three.
     corners_m : (n, 3) array
@@ -199,7 +200,9 @@ class _System:
     def reduced(self, damping: float = 0.0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Per view what it says on the statics (v, s, s), the gradient so reduced (s,), and H_xx^-1 H_xs (v, 6, s)."""
         H_xx = self.H_xx + damping * np.eye(6) * np.einsum("vii->vi", self.H_xx)[:, None]
-        solved = np.linalg.solve(H_xx, np.concatenate([np.swapaxes(self.H_sx, 1, 2), self.g_x[..., None]], axis=2))
+        solved = np.linalg.solve(
+            H_xx, np.concatenate([np.swapaxes(self.H_sx, 1, 2), self.g_x[..., None]], axis=2)
+        )
         taken = self.H_sx @ solved
         return taken[..., :-1], self.g_s - taken[..., -1].sum(axis=0), solved
 
@@ -279,7 +282,7 @@ def _solution(
     free: np.ndarray,
 ) -> Solution:
     n = len(lens)
-    residual, white, J_s, J_x = rows.linearised(lens, state[0][:n], state[0][n:], state[1])
+    residual, white, J_s, _ = rows.linearised(lens, state[0][:n], state[0][n:], state[1])
     sigma2 = float(np.sum(white[used] ** 2)) / _redundancy(rows, used, free)
     taken, _, solved = system.reduced()
     kept = J_s[..., free] * used[:, None, None]

@@ -86,10 +86,15 @@ def placing(
     Parameters
     ----------
     lens : Lens
-    intrinsics, covariance : (n,) and (n, n) arrays
+        Its model.
+    intrinsics : (n,) array
+        In the model's order.
+    covariance : (n, n) array
+        Of the intrinsics.
     size : (width, height)
         Of the picture, px.
     distance_m : float
+        From the camera to the tag.
     """
     uv = places_over(size)
     d, D = _displacement(lens, intrinsics, uv.reshape(-1, 2), distance_m)
@@ -118,11 +123,13 @@ def difference(
     Parameters
     ----------
     lens : Lens
+        Its model.
     one, other : pairs of (n,) and (n, n) arrays
         Intrinsics and their covariance.
     size : (width, height)
         Of the picture, px.
     distance_m : float
+        From the camera to the tag.
     """
     uv = places_over(size)
     flat = uv.reshape(-1, 2)

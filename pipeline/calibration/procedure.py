@@ -64,9 +64,11 @@ def calibrate_lens(
     Parameters
     ----------
     lens : Lens
+        Its model.
     views : sequence of View
         In the order of the recording.
     board : CalibrationBoard
+        What they show.
     size : (width, height)
         Of the pictures, px.
     distance_m : float
@@ -89,7 +91,7 @@ def calibrate_lens(
     _refuse_other_board(first, size)
     good = np.flatnonzero(first.views_used)
     _refuse_few(len(good))
-    chosen = good[most_telling(first.information[good], most)]
+    chosen = good[most_telling(list(first.information[good]), most)]
     views = [views[i] for i in chosen]
     solution = solve(lens, views, corners, first.intrinsics, first.T_camera_board[chosen])
     there = np.flatnonzero(solution.views_used)
@@ -134,8 +136,8 @@ def _halves(
 def _refuse_few(count: int) -> None:
     if count < LEAST_VIEWS:
         raise CalibrationError(
-            f"{count or 'no'} usable view{'' if count == 1 else 's'} of the board, at least {LEAST_VIEWS} are needed and "
-            "30 are good; wave the board before the camera, near and far, tilted, and into every corner of the picture"
+            f"{count or 'no'} usable view{'' if count == 1 else 's'} of the board, at least {LEAST_VIEWS} are needed "
+            "and 30 are good; wave the board before the camera, near and far, tilted, and into every corner of the picture"
         )
 
 
@@ -144,20 +146,20 @@ def _refuse_other_board(solution: Solution, size: tuple[int, int]) -> None:
     if solution.rms_px > WORST_RMS * size[0] or np.count_nonzero(used) < 0.5 * len(used):
         raise CalibrationError(
             f"the corners lie {solution.rms_px:.1f} px from where a board of this layout puts them, in "
-            f"{np.count_nonzero(used)} of {len(used)} views at all; correct --board: columns, rows, and the tag's side or "
-            "gap beside the square's"
+            f"{np.count_nonzero(used)} of {len(used)} views at all; correct --board: columns, rows, and the tag's "
+            "side or gap beside the square's"
         )
 
 
 def _refuse_unknown(solution: Solution, covered: Coverage, count: int) -> None:
     if covered.tilt_deg < ALIKE_DEG:
         raise CalibrationError(
-            f"the board has one attitude in all {count} views (within {covered.tilt_deg:.0f} degrees), so that focal length "
-            "and distance cannot be told apart; tilt it by 20 to 40 degrees to every side"
+            f"the board has one attitude in all {count} views (within {covered.tilt_deg:.0f} degrees), so that focal "
+            "length and distance cannot be told apart; tilt it by 20 to 40 degrees to every side"
         )
     part = float(np.max(solution.sigma[:2] / solution.intrinsics[:2]))
     if part > WORST_FOCAL:
         raise CalibrationError(
-            f"the focal length is known to {100 * part:.1f} % only, at most {100 * WORST_FOCAL:.0f} % is of use; add views "
-            "of the board tilted by 20 to 40 degrees, near and far"
+            f"the focal length is known to {100 * part:.1f} % only, at most {100 * WORST_FOCAL:.0f} % is of use; add "
+            "views of the board tilted by 20 to 40 degrees, near and far"
         )

@@ -25,7 +25,9 @@ def first_guess(
     Parameters
     ----------
     lens : Lens
+        Its model.
     views : sequence of View
+        All of them.
     corners_m : (n, 3) array
         Metres.
     size : (width, height)
@@ -76,14 +78,12 @@ def pose_of(lens: Lens, k: np.ndarray, view: View, corners_m: np.ndarray) -> tup
     p = corners_m[view.point.ravel()]
     T = np.eye(4)
     if np.count_nonzero(good) >= 6:
-        found, rotation, shift = cv2.solvePnP(
-            p[good], xy[good], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE
-        )
+        found, rotation, shift = cv2.solvePnP(p[good], xy[good], np.eye(3), None, flags=cv2.SOLVEPNP_IPPE)
         if found and np.all(np.isfinite(shift)) and shift[2, 0] > 0:
             T[:3, :3], T[:3, 3] = cv2.Rodrigues(rotation)[0], shift[:, 0]
             p_camera = p[good] @ T[:3, :3].T + T[:3, 3]
             miss = p_camera[:, :2] / p_camera[:, 2:] - xy[good]
-            return T, float(np.sqrt(np.mean(miss**2)) / max(np.mean(good), 0.1) ** 2)
+            return T, float(np.sqrt(np.mean(miss**2)) / max(float(np.mean(good)), 0.1) ** 2)
     raise CalibrationError(f"{view.name}: no camera shows the board like this; is it this board?")
 
 

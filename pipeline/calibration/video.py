@@ -25,9 +25,14 @@ def frames_of_video(path: Path, most: int) -> Iterator[tuple[str, np.ndarray]]:
             if number % step == 0:
                 good, frame = video.retrieve()
                 if good:
-                    yield f"frame {number}", frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+                    yield (
+                        f"frame {number}",
+                        frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY),
+                    )
             number += 1
         if not number:
-            raise CalibrationError(f"{path}: no frame can be read; convert the video to MP4 (H.264), or to pictures")
+            raise CalibrationError(
+                f"{path}: no frame can be read; convert the video to MP4 (H.264), or to pictures"
+            )
     finally:
         video.release()

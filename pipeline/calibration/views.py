@@ -17,7 +17,8 @@ between corners count: the residuals tell how much corners scatter."""
 @dataclass(frozen=True)
 class View:
     """One picture of the board. Corners come in groups that were measured together: one corner of a chessboard, the
-    four of a tag."""
+    four of a tag.
+    """
 
     name: str
     """Of the picture: a file or a time."""
@@ -40,7 +41,9 @@ def view_of(name: str, point: np.ndarray, uv: np.ndarray, cov: np.ndarray | floa
     Parameters
     ----------
     name : str
+        Of the picture.
     point : (m,) int array
+        Which corners of the board.
     uv : (m, 2) array
         Pixels.
     cov : (m, 2, 2) array or float
@@ -106,6 +109,7 @@ def most_telling(information: Sequence[np.ndarray], most: int) -> list[int]:
     information : sequence of (n, n) arrays
         Of each view on the intrinsics, its own pose reduced out.
     most : int
+        How many to keep.
 
     Returns
     -------

@@ -19,7 +19,9 @@ import click
     "apriltag:COLUMNSxROWS:TAG:GAP:FAMILY[:FIRST_ID].",
 )
 @click.option("--camera", metavar="NAME", default="", help="Name of the camera in machine.toml.")
-@click.option("--topic", metavar="TOPIC", default="", help="Its pictures in the log; else as machine.toml says.")
+@click.option(
+    "--topic", metavar="TOPIC", default="", help="Its pictures in the log; else as machine.toml says."
+)
 @click.option(
     "--machine",
     metavar="FILE",
@@ -41,7 +43,9 @@ import click
     show_default=True,
     help="Working distance at which millimetres are told.",
 )
-@click.option("--size", metavar="WxH", default="", help="Size of the pictures, px; only of a corner file (vnl).")
+@click.option(
+    "--size", metavar="WxH", default="", help="Size of the pictures, px; only of a corner file (vnl)."
+)
 @click.option(
     "--out",
     metavar="FILE",

@@ -1,10 +1,10 @@
 """Lens models for calibration: Brown's with five and with eight coefficients, and the fisheye, with Jacobians.
 
-Models, order and signs are OpenCV's. With ``x = X / Z``, ``y = Y / Z``, ``r² = x² + y²``:
+Models, order and signs are OpenCV's; the fisheye is that of Kannala and Brandt (2006). With ``x = X / Z``, ``y = Y / Z``, ``r² = x² + y²``:
 
     brown5    radial = 1 + k1 r² + k2 r⁴ + k3 r⁶
     brown8    radial = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
-    fisheye   radial = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸) / r, theta = atan r (Kannala and Brandt)
+    fisheye   radial = theta (1 + k1 theta² + k2 theta⁴ + k3 theta⁶ + k4 theta⁸) / r, theta = atan r
 
 and Brown's two tangential terms beside the first two radials. The adjustment of logs knows `brown5` alone, which
 `pipeline.geometry.camera` computes; what a lens needs more coefficients for shows in how far `brown5` is off.
@@ -58,6 +58,7 @@ class Lens:
         p_camera : (..., 3) array
             Metres.
         intrinsics : (n,) array
+            In the order of `parameters`.
 
         Returns
         -------
@@ -77,7 +78,11 @@ class Lens:
         J_uv_p = np.empty(J_uv_xy.shape[:-1] + (3,))
         J_uv_p[..., :2] = J_uv_xy / z[..., None, None]
         J_uv_p[..., 2] = -np.einsum("...ij,...j->...i", J_uv_p[..., :2], xy)
-        return camera.to_pixels(xy_distorted, k), J_uv_p, self._pixels_by_intrinsics(xy_distorted, J_distorted_k, k)
+        return (
+            camera.to_pixels(xy_distorted, k),
+            J_uv_p,
+            self._pixels_by_intrinsics(xy_distorted, J_distorted_k, k),
+        )
 
     def directions(self, uv: np.ndarray, intrinsics: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Unit vectors of the rays that pixels look along, and how they move with the intrinsics.
@@ -87,6 +92,7 @@ class Lens:
         uv : (..., 2) array
             Pixels.
         intrinsics : (n,) array
+            In the order of `parameters`.
 
         Returns
         -------
@@ -219,8 +225,6 @@ def _equidistant(r2: np.ndarray, k: np.ndarray) -> tuple[np.ndarray, np.ndarray,
 
 
 BROWN5 = Lens("brown5", camera.INTRINSICS, _polynomial, (4, 5, 8), (6, 7))
-BROWN8 = Lens(
-    "brown8", (*camera.INTRINSICS, "k4", "k5", "k6"), _rational, (4, 5, 8, 9, 10, 11), (6, 7)
-)
+BROWN8 = Lens("brown8", (*camera.INTRINSICS, "k4", "k5", "k6"), _rational, (4, 5, 8, 9, 10, 11), (6, 7))
 FISHEYE = Lens("fisheye", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"), _equidistant, (4, 5, 6, 7), ())
 LENSES = {lens.name: lens for lens in (BROWN5, BROWN8, FISHEYE)}

@@ -21,7 +21,9 @@ def draw_coverage(found: Intrinsics) -> Figure:
     """Every corner of every view, with what it misses its prediction by."""
     uv = np.concatenate([view.uv.reshape(-1, 2) for view in found.views])
     residual = np.concatenate([part.reshape(-1, 2) for part in found.solution.residual_px])
-    used = np.concatenate([np.repeat(part, view.point.shape[1]) for part, view in zip(found.solution.used, found.views)])
+    used = np.concatenate(
+        [np.repeat(part, view.point.shape[1]) for part, view in zip(found.solution.used, found.views)]
+    )
     step = max(len(uv) // MOST_DOTS, 1)
     uv, residual, used = uv[::step], residual[::step], used[::step]
     figure = new_figure(3.1)
@@ -74,8 +76,11 @@ def _maps(
         _frame(at, size, title)
         at.grid(False)
         drawn = at.contourf(uv[..., 0], uv[..., 1], 1000 * values_m, levels=levels, cmap=_LOW_TO_BAD)
-        lines = at.contour(uv[..., 0], uv[..., 1], 1000 * values_m, levels=levels, colors=palette.MUTED, linewidths=0.4)
+        lines = at.contour(
+            uv[..., 0], uv[..., 1], 1000 * values_m, levels=levels, colors=palette.MUTED, linewidths=0.4
+        )
         at.clabel(lines, fmt="%.2g", fontsize=6.5)
+    assert drawn is not None
     bar = figure.colorbar(drawn, ax=list(axes), shrink=0.85)
     bar.set_label("mm")
 

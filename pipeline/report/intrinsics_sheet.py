@@ -14,9 +14,9 @@ from pipeline.report.sheet import GOOD, OPEN, POOR, Part, Picture, Sheet
 from pipeline.report.units import text_of
 from pipeline.report.words import Words
 
-GOOD_M = 0.005
-"""Standard deviation of a tag's place at the working distance up to which a lens is known well enough: a fifth of the
-paper's inch, of which mounts, survey and corners want their part."""
+GOOD_M = 0.010
+"""Standard deviation of a tag's place at the working distance up to which a lens is known well enough: two fifths
+of the paper's inch, of which mounts, survey and corners want their part."""
 FEW_VIEWS = 15
 
 
@@ -28,6 +28,7 @@ def intrinsics_sheet(
     Parameters
     ----------
     found : Intrinsics
+        What was told.
     camera : str
         How people call it.
     board : str
@@ -36,6 +37,8 @@ def intrinsics_sheet(
         Pictures that were looked at.
     origin : mapping
         Keys of ``intrinsics.origin`` in the words -> text.
+    language : str
+        Of the words.
     """
     words = Words(language)
 
@@ -104,7 +107,9 @@ def intrinsics_sheet(
             "limit": f"{halves.limit:.2f}",
             "distance": distance,
         }
-        picture = Picture("halves", w("halves_map"), w("halves_good"), w("halves_seen"), lambda: draw_halves(found))
+        picture = Picture(
+            "halves", w("halves_map"), w("halves_good"), w("halves_seen"), lambda: draw_halves(found)
+        )
         parts.insert(
             1,
             Part(
@@ -125,9 +130,15 @@ def intrinsics_sheet(
             (
                 w("halves_rms"),
                 number(1000 * halves.found_rms_m if halves else None, "mm", 1),
-                w("halves_note", predicted=f"{1000 * halves.predicted_rms_m:.1f}") if halves else w("halves_none"),
+                w("halves_note", predicted=f"{1000 * halves.predicted_rms_m:.1f}")
+                if halves
+                else w("halves_none"),
             ),
-            (w("focal"), number(float(solution.intrinsics[0]), "px", 2), w("focal_note", sigma=f"{solution.sigma[0]:.2f}")),
+            (
+                w("focal"),
+                number(float(solution.intrinsics[0]), "px", 2),
+                w("focal_note", sigma=f"{solution.sigma[0]:.2f}"),
+            ),
             (w("residual"), number(solution.rms_px, "px", 3), w("residual_note", used=used)),
         ],
         remarks=_remarks(found, words, used),

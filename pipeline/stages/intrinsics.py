@@ -106,9 +106,13 @@ def calibrate_intrinsics(
     views: list[View]
     if source.suffix == CORNERS:
         if printed.kind != CHESSBOARD:
-            raise CalibrationError(f"{source}: a corner file has the corners of a chessboard; correct --board")
+            raise CalibrationError(
+                f"{source}: a corner file has the corners of a chessboard; correct --board"
+            )
         if size is None:
-            raise UsageError(f"{source} does not say how large the pictures were; give --size, for example 1280x720")
+            raise UsageError(
+                f"{source} does not say how large the pictures were; give --size, for example 1280x720"
+            )
         views, odd = views_of_corner_file(read_file(source).decode("utf-8", "replace"), printed)
         if odd and not views:
             raise CalibrationError(
@@ -121,14 +125,16 @@ def calibrate_intrinsics(
             found_size = (grey.shape[1], grey.shape[0])
             if size is not None and found_size != size:
                 raise CalibrationError(
-                    f"{source}: {name} is {found_size[0]}x{found_size[1]} px, others {size[0]}x{size[1]}; intrinsics belong "
-                    "to one size of picture: keep those apart"
+                    f"{source}: {name} is {found_size[0]}x{found_size[1]} px, others {size[0]}x{size[1]}; intrinsics "
+                    "belong to one size of picture: keep those apart"
                 )
             size = found_size
             finder.add(name, grey)
             watch(finder.pictures)
         if not finder.pictures or size is None:
-            raise CalibrationError(f"{source}: there is no picture that can be read ({pictures.fault or 'none at all'})")
+            raise CalibrationError(
+                f"{source}: there is no picture that can be read ({pictures.fault or 'none at all'})"
+            )
         if not finder.found and (seen := finder.instead()):
             raise CalibrationError(
                 f"{source}: the board {printed.text} is in none of {finder.pictures} pictures; {seen}; correct --board"
@@ -190,7 +196,9 @@ class _Pictures:
     def _folder(self, folder: Path) -> Iterator[tuple[str, np.ndarray]]:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
         if not files:
-            raise CalibrationError(f"{folder}: holds no picture (png, jpg), no video (mp4) and no corner file (vnl)")
+            raise CalibrationError(
+                f"{folder}: holds no picture (png, jpg), no video (mp4) and no corner file (vnl)"
+            )
         for file in files[:: -(-len(files) // MOST_PICTURES)]:
             try:
                 yield file.name, decode_grey(file.read_bytes(), PICTURES[file.suffix.lower()])
@@ -199,7 +207,9 @@ class _Pictures:
 
     def _log(self, log: Path) -> Iterator[tuple[str, np.ndarray]]:
         with read_log(log) as reader:
-            counts = {c.topic: c.count for c in reader.channels if c.carries == IMAGE and c.count}
+            counts = {
+                c.topic: c.message_count for c in reader.channels if c.carries == IMAGE and c.message_count
+            }
             topic = self.recording.topic
             if not topic:
                 if len(counts) != 1:

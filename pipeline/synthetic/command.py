@@ -9,6 +9,7 @@ from pathlib import Path
 
 from pipeline.errors import UsageError
 from pipeline.synthetic import recording, specification
+from pipeline.synthetic.calibration_logs import LOGS
 from pipeline.synthetic.cycle import CYCLE_S, TRAM_S
 from pipeline.synthetic.specification import Specification
 
@@ -58,7 +59,7 @@ def make(
     folder
         Left out: ``sample_logs/trench`` for the committed sample, else ``sample_logs/generated/<name>``.
     site
-        ``trench`` or ``other``.
+        ``trench`` or ``other``, or one of `calibration_logs.LOGS`: a log that calibrates the machine of the trench.
     minutes
         At least this long, in whole cycles; left out, the site's own four cycles.
     size
@@ -74,6 +75,9 @@ def make(
     ------
     UsageError
     """
+    if site in LOGS:
+        default = DRAWN / (site if (size, seed) == ("640", SAMPLE_SEED) else f"{site}-{size}-{seed}")
+        return LOGS[site](specification_of(size=size), seed, default if folder is None else folder, progress)
     spec = specification_of(site, minutes, size)
     if (site, minutes, size, seed) != ("trench", None, "640", SAMPLE_SEED):
         length = "" if minutes is None else f"-{minutes:g}min"

@@ -92,7 +92,7 @@ class WavedBoard:
         rng = np.random.default_rng([self.seed, 32])
         width, height = self.size
         middle = np.array([*self.board.size_m, 0.0]) / 2 - [self.board.square_m, self.board.square_m, 0]
-        found = []
+        found: list[np.ndarray] = []
         while len(found) < count:
             share = 0.5 if alike else rng.uniform(0.35, 0.9)
             z = self.intrinsics[0] * self.board.size_m[0] / (share * width)
@@ -108,7 +108,9 @@ class WavedBoard:
                 found.append(T)
         return np.array(found)
 
-    def picture(self, index: int, T_camera_board: np.ndarray, blur_px: float = 0.7, noise: float = 1.6) -> np.ndarray:
+    def picture(
+        self, index: int, T_camera_board: np.ndarray, blur_px: float = 0.7, noise: float = 1.6
+    ) -> np.ndarray:
         """(H, W) uint8."""
         rng = np.random.default_rng([self.seed, 33, index])
         width, height = self.size
