@@ -20,11 +20,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import chi2
 
-from pipeline.calibration.view_errors import shared_factor
+from pipeline.calibration.view_errors import with_shared_errors
 from pipeline.calibration.views import View
 from pipeline.errors import CalibrationError
 from pipeline.geometry import se3, so3
-from pipeline.geometry.lenses import Lens
+from pipeline.geometry.lenses import BROWN8, Lens
 
 HUBER = 2.0
 """Residual of a group, in units of what it should be, from which it pulls no stronger."""
@@ -33,7 +33,10 @@ OUTLIER = 1e-5
 BAD_VIEW = 0.2
 """Share of outliers from which a whole view is left out: what bends a board in one corner bends the rest of it too. In
 a set of twelve, two views with a quarter of such corners moved the principal point by five sigmas."""
-_STEPS = 60
+HOLD = 10.0
+"""Standard deviation of the coefficients below the line of the eight-coefficient model around zero: above and below
+they all but cancel, and free they wander off to hundreds without moving a pixel."""
+_STEPS = 100
 _SETTLED = 1e-4
 """Length of a step in posterior standard deviations."""
 _BEND = 2
@@ -61,7 +64,7 @@ class Solution:
     sigma0: float
     """Scatter of corners over what their covariances say."""
     shared_factor: float
-    """By which the covariance grew for what the corners of a view share (`view_errors`)."""
+    """By which the covariance grew on the whole for what the corners of a view share (`view_errors`)."""
 
     @property
     def rms_px(self) -> float:
@@ -227,13 +230,14 @@ def _assembled(
         return np.asarray(np.add.reduceat(a, rows.starts, axis=0))
 
     flat = J_s.reshape(-1, len(free))
+    held = _held(lens, len(free))
     J_st, J_xt = np.swapaxes(J_s, 1, 2), np.swapaxes(J_x, 1, 2)
     return _System(
-        cost=float(np.sum(white**2)),
-        H_ss=flat.T @ flat,
+        cost=float(np.sum(white**2) + held @ state[0][free] ** 2),
+        H_ss=flat.T @ flat + np.diag(held),
         H_sx=by_view(J_st @ J_x),
         H_xx=by_view(J_xt @ J_x) + 1e-9 * np.eye(6),
-        g_s=flat.T @ white.ravel(),
+        g_s=flat.T @ white.ravel() - held * state[0][free],
         g_x=by_view((J_xt @ white[..., None])[..., 0]),
     )
 
@@ -290,7 +294,7 @@ def _solution(
     own = np.add.reduceat(J_st @ kept, rows.starts, axis=0) - taken
     pull = np.add.reduceat((J_st @ white[..., None])[..., 0], rows.starts, axis=0)
     pull = pull - np.einsum("vsi,vi->vs", system.H_sx, solved[..., -1])
-    S = own.sum(axis=0)
+    S = own.sum(axis=0) + np.diag(_held(lens, len(free)))
     scale = 1 / np.sqrt(np.maximum(np.diag(S), 1e-300))
     balanced = S * scale[:, None] * scale
     if np.linalg.eigvalsh(balanced)[0] < 1e-14:
@@ -299,9 +303,12 @@ def _solution(
             "and in every corner of the picture"
         )
     there = np.logical_or.reduceat(used, rows.starts)
-    shared = shared_factor(own[there] * scale[:, None] * scale / sigma2, pull[there] * scale / sigma2)
-    covariance = shared * sigma2 * np.linalg.inv(balanced) * scale[:, None] * scale
-    covariance = 0.5 * (covariance + covariance.T)[:n, :n]
+    held = np.diag(_held(lens, len(free))) / max(int(np.count_nonzero(there)), 1)
+    covariance, shared = with_shared_errors(
+        (own[there] + held) * scale[:, None] * scale / sigma2, pull[there] * scale / sigma2
+    )
+    covariance = (covariance * scale[:, None] * scale)[:n, :n]
+    covariance = 0.5 * (covariance + covariance.T)
     cuts = rows.starts[1:]
     return Solution(
         lens=lens,
@@ -315,6 +322,14 @@ def _solution(
         sigma0=float(np.sqrt(sigma2)),
         shared_factor=shared,
     )
+
+
+def _held(lens: Lens, count: int) -> np.ndarray:
+    """(count,) weights that draw statics to zero."""
+    held = np.zeros(count)
+    if lens is BROWN8:
+        held[9:12] = HOLD**-2
+    return held
 
 
 def _redundancy(rows: _Rows, used: np.ndarray, free: np.ndarray) -> int:

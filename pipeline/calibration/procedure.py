@@ -137,7 +137,8 @@ def _refuse_few(count: int) -> None:
     if count < LEAST_VIEWS:
         raise CalibrationError(
             f"{count or 'no'} usable view{'' if count == 1 else 's'} of the board, at least {LEAST_VIEWS} are needed "
-            "and 30 are good; wave the board before the camera, near and far, tilted, and into every corner of the picture"
+            "and 30 are good; wave the board before the camera, near and far, tilted, and into every corner of the "
+            "picture"
         )
 
 

@@ -1,6 +1,7 @@
 """Lens models for calibration: Brown's with five and with eight coefficients, and the fisheye, with Jacobians.
 
-Models, order and signs are OpenCV's; the fisheye is that of Kannala and Brandt (2006). With ``x = X / Z``, ``y = Y / Z``, ``r² = x² + y²``:
+Models, order and signs are OpenCV's; the fisheye is that of Kannala and Brandt (2006). With ``x = X / Z``,
+``y = Y / Z``, ``r² = x² + y²``:
 
     brown5    radial = 1 + k1 r² + k2 r⁴ + k3 r⁶
     brown8    radial = (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶)
