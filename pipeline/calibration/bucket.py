@@ -1,0 +1,401 @@
+"""What the bucket's sensor and its cutting edge are, told by points that the edge touched.
+
+One touch: the machine stands still with its edge on a known point, or a total station measures a tooth while it
+stands. The cameras tell where the stick is, so
+
+    p = T_world_axis exp(a) Rz(angle(raw)) T_bucket_tool exp(t) p_tool  -  d
+
+with ``angle = linkage(curve(raw))``, or the curve alone. Unknown are the curve, the bars of the linkage, the pin on the
+stick ``a``, the tool ``t``, the errors ``f`` that the poses of all touches share, and the error ``d`` of each known
+point. All but the curve have a prior. In the plane of the bucket, the part of a touch towards the pin tells the
+distance from pin to edge, the part across it tells the angle.
+
+An angle in this chain shows only as a sum: of the axis about its own z, of the curve's zero, of the horn and of the
+direction from pin to edge. Here each keeps its prior and nothing is held; what stands in the file afterwards is chosen
+in `curve_fit`. The axis about z is exact: angle zero is where the file says that the axis frame's x points.
+
+The curve is a sum of powers of ``u``, the raw reading brought to -1 .. 1 over the touches, so that its prior can be
+wide (`WIDE`) in every coefficient without a loss of digits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pipeline.geometry import linkage, se3, so3
+
+WIDE = {"cylinder_m": 2.0, "angle_deg": 400.0}
+"""Prior sigma of each coefficient over ``u``: no cylinder and no turn is longer."""
+HUBER = 2.5
+ITERATIONS = 60
+STEP_SIGMAS = 1e-6
+"""The iteration ends with a step smaller than this in prior or posterior standard deviations."""
+AXIS, TOOL, BARS = slice(0, 6), slice(6, 12), slice(12, 21)
+"""Places among the unknowns with a prior; the curve follows, then shared errors, then known points."""
+CURVE_FROM = 21
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """What machine.toml says of stick, bucket and sensor."""
+
+    axis: np.ndarray
+    """(6, 6) prior covariance of the pin's frame on the stick, right perturbation, the turn about z exact."""
+    T_bucket_tool: np.ndarray
+    """(4, 4)."""
+    tool: np.ndarray
+    """(6, 6) its prior covariance."""
+    width_m: float
+    """Of the cutting edge."""
+    output: str
+    """`cylinder_m`, or `angle_deg` for a sensor without linkage."""
+    coefficients: int
+    """Of the curve."""
+    bars: np.ndarray
+    """(9,) in the order of `linkage.PARAMETERS`, the last one 0; not used for `angle_deg`."""
+    bars_covariance: np.ndarray
+    """(9, 9)."""
+    side: int = 1
+    """Which way round the linkage is built."""
+
+
+@dataclass(frozen=True, eq=False)
+class Stand:
+    """The machine at rest at one bucket angle."""
+
+    name: str
+    T_world_axis: np.ndarray
+    """(4, 4) the pin's frame on the stick, mean over the rest."""
+    own: np.ndarray
+    """(6, 6) what no other stand shares: error along and about the world's axes, m² and rad²."""
+    factors: np.ndarray
+    """(6, r) response to the r independent errors of unit variance that all stands share."""
+    raw: float
+    """Mean reading."""
+    raw_sigma: float
+
+
+@dataclass(frozen=True, eq=False)
+class Touch:
+    """One place of the edge whose coordinates are known."""
+
+    name: str
+    stand: int
+    """Index of the stand; several touches may share one."""
+    p_world: np.ndarray
+    """(3,) metres."""
+    sigma_m: float
+    """Of each coordinate, this touch alone: shot, or how well the tooth sits on the point."""
+    point: int = -1
+    """Index of the known point, whose own error all its touches share; -1 for a shot of its own."""
+    edge_point: str = "middle"
+    """left, middle, right, or empty: anywhere along the edge, and nothing is told along it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adjusted:
+    """The answer, with everything that is needed to judge it."""
+
+    rig: Rig
+    stands: tuple[Stand, ...]
+    touches: tuple[Touch, ...]
+    middle: float
+    """Raw reading at ``u = 0``."""
+    half: float
+    """Raw unit per unit of ``u``."""
+    value: np.ndarray
+    """(p,) unknowns: axis 6, tool 6, bars 9, curve over u, shared errors, known points 3 each."""
+    covariance: np.ndarray
+    """(p, p)."""
+    residual: np.ndarray
+    """(n, 3) given minus adjusted point, world axes, metres."""
+    J: np.ndarray
+    """(3n, p) of the adjusted points."""
+    noise: np.ndarray
+    """(3n, 3n) covariance of what the unknowns do not explain."""
+    factors: int
+    """Number of shared errors."""
+    pull: float = 0.0
+    """Sum of squares of the unknowns against their priors, the curve's left out."""
+
+    @property
+    def curve(self) -> slice:
+        """Places of the curve's coefficients over u."""
+        return slice(CURVE_FROM, CURVE_FROM + self.rig.coefficients)
+
+    def T_bucket_tool(self) -> np.ndarray:
+        """(4, 4) adjusted."""
+        return se3.retract(self.rig.T_bucket_tool, self.value[TOOL])
+
+    def output(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Cylinder length (m) or angle (deg) at readings (n,), and (n, coefficients) its Jacobian."""
+        powers = self.powers(raw)
+        return powers @ self.value[self.curve], powers
+
+    def powers(self, raw: np.ndarray) -> np.ndarray:
+        """(n, coefficients) powers of u."""
+        u = (np.asarray(raw, float) - self.middle) / self.half
+        return u[..., None] ** np.arange(self.rig.coefficients)
+
+    def angle(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Angle of the bucket at readings (n,), radians, nan beyond the bars' reach; and (n, p) its Jacobian."""
+        y, powers = self.output(raw)
+        J = np.zeros((len(y), len(self.value)))
+        angle, J_y, J_bars = angle_of(self.rig, y, self.value[BARS])
+        J[:, BARS] = J_bars
+        J[:, self.curve] = J_y[:, None] * powers
+        return angle, J
+
+    def chi_square(self) -> tuple[float, int]:
+        """Weighted sum of squares of residuals and priors, and the redundancy that it should be near."""
+        v = self.residual.ravel()
+        told = sum(3 if touch.edge_point else 2 for touch in self.touches)
+        return float(v @ np.linalg.solve(self.noise, v)) + self.pull, told - self.rig.coefficients
+
+
+def angle_of(rig: Rig, y: np.ndarray, d_bars: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Angle (n,) of the bucket from what the curve gives, radians, with J_angle_y (n,) and J_angle_bars (n, 9)."""
+    if rig.output == "cylinder_m":
+        return linkage.bucket_angle_with_jacobians(y, rig.bars + d_bars, rig.side)
+    return np.deg2rad(y), np.full(len(y), np.deg2rad(1.0)), np.zeros((len(y), 9))
+
+
+def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: Sequence[float]) -> Adjusted:
+    """Curve, tool and pin from touches: robust first, so that what is wrong is seen where it is, then by least squares.
+
+    Parameters
+    ----------
+    rig : Rig
+        Priors. Where the file has the curve does not matter.
+    stands : sequence of Stand
+        At least as many as the curve has coefficients.
+    touches : sequence of Touch
+        In any order.
+    points : sequence of float
+        Sigma of each coordinate of each known point, metres.
+
+    Returns
+    -------
+    Adjusted
+        Of the last step, which no robust weight touched.
+
+    Raises
+    ------
+    FloatingPointError
+        No curve brings the edge near the points within the reach of the bars.
+    """
+    raw = np.array([stand.raw for stand in stands])
+    middle, half = 0.5 * (raw.min() + raw.max()), max(0.5 * float(np.ptp(raw)), 1e-12)
+    scale = _prior_scale(rig, stands[0].factors.shape[1], points)
+    empty = np.zeros((0, 0))
+    found = Adjusted(
+        rig, tuple(stands), tuple(touches), middle, half, np.zeros(len(scale)), empty, np.zeros((0, 3)), empty, empty,
+        stands[0].factors.shape[1],
+    )  # fmt: skip
+    found = replace(found, value=_start(found))
+    robust = _iterate(found, scale, huber=True)
+    return _iterate(robust, scale, huber=False)
+
+
+def _prior_scale(rig: Rig, factors: int, points: Sequence[float]) -> np.ndarray:
+    """(p, q) square root of the prior covariance, without columns for what is exact."""
+    blocks = [
+        _root(rig.axis),
+        _root(rig.tool),
+        _root(rig.bars_covariance if rig.output == "cylinder_m" else np.zeros((9, 9))),
+        np.eye(rig.coefficients) * WIDE[rig.output],
+        np.eye(factors),
+        *[np.eye(3) * sigma for sigma in points],
+    ]
+    scale = np.zeros((sum(b.shape[0] for b in blocks), sum(b.shape[1] for b in blocks)))
+    row = column = 0
+    for block in blocks:
+        scale[row : row + block.shape[0], column : column + block.shape[1]] = block
+        row, column = row + block.shape[0], column + block.shape[1]
+    return scale
+
+
+def _root(covariance: np.ndarray) -> np.ndarray:
+    sigma = np.sqrt(np.diagonal(covariance))
+    unit = np.where(sigma > 0, sigma, 1.0)  # metres and radians are not comparable, correlations are
+    values, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    free = values > 1e-12
+    return unit[:, None] * vectors[:, free] * np.sqrt(values[free])
+
+
+def _start(found: Adjusted) -> np.ndarray:
+    """First values: the angle that each touch shows, through the bars as the file has them, and a polynomial.
+
+    One touch may be wrong altogether, so the polynomial is fitted without each of them in turn, and the one that most
+    others agree with is taken.
+    """
+    rig = found.rig
+    raw, y = [], []
+    for touch in found.touches:
+        stand = found.stands[touch.stand]
+        p_axis = se3.transform(se3.inverse(stand.T_world_axis), touch.p_world)
+        p_bucket = se3.transform(rig.T_bucket_tool, _on_tool(rig, touch, 0.0))
+        angle = np.arctan2(p_axis[1], p_axis[0]) - np.arctan2(p_bucket[1], p_bucket[0])
+        angle = np.pi - np.mod(np.pi - angle, 2 * np.pi)
+        raw.append(stand.raw)
+        y.append(
+            linkage.cylinder_length(angle, rig.bars, rig.side)
+            if rig.output == "cylinder_m"
+            else np.rad2deg(angle)
+        )
+    order = np.argsort(raw, kind="stable")
+    reading, shown = np.array(raw)[order], np.array(y)[order]
+    good = np.isfinite(shown)
+    if good.sum() < rig.coefficients:
+        raise FloatingPointError("the bars cannot reach the touches")
+    reading, shown = reading[good], shown[good]
+    if rig.output == "angle_deg":
+        shown = np.rad2deg(np.unwrap(np.deg2rad(shown)))
+    powers = found.powers(reading)
+    best, least = np.zeros(rig.coefficients), np.inf
+    for left_out in range(-1, len(reading)):
+        kept = np.arange(len(reading)) != left_out
+        if kept.sum() < rig.coefficients:
+            continue
+        c = np.linalg.lstsq(powers[kept], shown[kept], rcond=None)[0]
+        misfit = float(np.median(np.abs(powers @ c - shown)))
+        if misfit < least * 0.999:
+            best, least = c, misfit
+    value = found.value.copy()
+    value[found.curve] = best
+    return value
+
+
+def _on_tool(rig: Rig, touch: Touch, along_m: float) -> np.ndarray:
+    half = 0.5 * rig.width_m
+    return np.array([{"left": -half, "middle": 0.0, "right": half}.get(touch.edge_point, along_m), 0.0, 0.0])
+
+
+def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
+    """Gauss-Newton on ``value = scale z`` with ``z ~ N(0, I)`` and the curve's prior about zero, nearly flat."""
+    value = found.value
+    z = np.linalg.lstsq(scale, value, rcond=None)[0]
+    weight = np.ones(len(found.touches))
+    for _ in range(ITERATIONS):
+        residual, J, noise = _linearised(found, value)
+        if not np.all(np.isfinite(J)):
+            raise FloatingPointError("the bars cannot reach the touches")
+        block = np.repeat(1.0 / np.sqrt(weight), 3)
+        whole = noise * np.outer(block, block)
+        A = J @ scale
+        normal = A.T @ np.linalg.solve(whole, A) + np.eye(scale.shape[1])
+        step = np.linalg.solve(normal, A.T @ np.linalg.solve(whole, residual) - z)
+        ahead = 1.0
+        while ahead > 1e-3 and not _reaches(found, value + ahead * (scale @ step)):
+            ahead *= 0.5
+        z = z + ahead * step
+        value = scale @ z
+        size = float(np.sqrt(step @ normal @ step))
+        if huber:
+            before = weight
+            residual = _linearised(found, value)[0].reshape(-1, 3)
+            own = np.array([noise[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(residual))])
+            normalised = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(own), residual) / 3)
+            weight = np.minimum(1.0, HUBER / np.maximum(normalised, 1e-12))
+            if size < 1e-3 and np.abs(weight - before).max() < 1e-3:
+                break
+        elif size < STEP_SIGMAS:
+            break
+    residual, J, noise = _linearised(found, value)
+    A = J @ scale
+    normal = A.T @ np.linalg.solve(noise, A) + np.eye(scale.shape[1])
+    covariance = scale @ np.linalg.solve(normal, scale.T)
+    of_curve = np.any(scale[found.curve] != 0, axis=0)
+    return replace(
+        found,
+        value=value,
+        covariance=0.5 * (covariance + covariance.T),
+        residual=residual.reshape(-1, 3),
+        J=J,
+        noise=noise,
+        pull=float(np.sum(z[~of_curve] ** 2)),
+    )
+
+
+def _reaches(found: Adjusted, value: np.ndarray) -> bool:
+    moved = replace(found, value=value)
+    return bool(np.all(np.isfinite(moved.angle(np.array([s.raw for s in found.stands]))[0])))
+
+
+def _linearised(found: Adjusted, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(3n,) given minus adjusted, (3n, p) Jacobian of the adjusted, (3n, 3n) covariance of the rest."""
+    rig = found.rig
+    at = replace(found, value=value)
+    raw = np.array([stand.raw for stand in found.stands])
+    angle, J_angle = at.angle(raw)
+    y_slope = np.polynomial.polynomial.polyval(
+        (raw - at.middle) / at.half, np.polynomial.polynomial.polyder(value[at.curve])
+    )
+    J_angle_y = angle_of(rig, at.output(raw)[0], value[BARS])[1]
+    J_angle_raw = J_angle_y * y_slope / at.half
+    n, p = len(found.touches), len(value)
+    residual, J = np.empty(3 * n), np.zeros((3 * n, p))
+    per_stand = np.zeros((3 * n, 7 * len(found.stands)))
+    noise = np.zeros((3 * n, 3 * n))
+    first_factor = CURVE_FROM + rig.coefficients
+    first_point = first_factor + found.factors
+    exp_axis, exp_tool = se3.exp(value[AXIS]), se3.exp(value[TOOL])
+    Jr_axis, Jr_tool = se3.Jr(value[AXIS]), se3.Jr(value[TOOL])
+    for i, touch in enumerate(found.touches):
+        stand, k = found.stands[touch.stand], touch.stand
+        rows = slice(3 * i, 3 * i + 3)
+        turn = se3.from_rotation_translation(so3.exp(np.array([0.0, 0.0, angle[k]])), np.zeros(3))
+        T_world_bucket = stand.T_world_axis @ exp_axis @ turn
+        T_world_tool = T_world_bucket @ rig.T_bucket_tool @ exp_tool
+        along = 0.0
+        if not touch.edge_point:
+            along = float((touch.p_world - T_world_tool[:3, 3]) @ T_world_tool[:3, 0])
+            along = float(np.clip(along, -0.5 * rig.width_m, 0.5 * rig.width_m))
+        p_tool = _on_tool(rig, touch, along)
+        p_axis = se3.transform(turn @ rig.T_bucket_tool @ exp_tool, p_tool)
+        R_axis = (stand.T_world_axis @ exp_axis)[:3, :3]
+        p_world = se3.transform(T_world_tool, p_tool)
+        lever = p_world - stand.T_world_axis[:3, 3]
+        G = np.hstack([np.eye(3), -so3.hat(lever)])
+        d_angle = R_axis @ np.array([-p_axis[1], p_axis[0], 0.0])
+        J[rows] = np.outer(d_angle, J_angle[k])
+        J[rows, AXIS] += R_axis @ np.hstack([np.eye(3), -so3.hat(p_axis)]) @ Jr_axis
+        J[rows, TOOL] += T_world_tool[:3, :3] @ np.hstack([np.eye(3), -so3.hat(p_tool)]) @ Jr_tool
+        J[rows, first_factor:first_point] = G @ stand.factors
+        shared = value[first_factor:first_point]
+        p_given = p_world + G @ stand.factors @ shared
+        if touch.point >= 0:
+            d = slice(first_point + 3 * touch.point, first_point + 3 * touch.point + 3)
+            J[rows, d] = -np.eye(3)
+            p_given = p_given - value[d]
+        residual[rows] = touch.p_world - p_given
+        noise[rows, rows] += touch.sigma_m**2 * np.eye(3)
+        if not touch.edge_point:
+            u = T_world_tool[:3, 0]
+            noise[rows, rows] += (0.5 * rig.width_m) ** 2 * np.outer(u, u)
+        per_stand[rows, 7 * k : 7 * k + 6] = G @ _symmetric_root(stand.own)
+        per_stand[rows, 7 * k + 6] = d_angle * J_angle_raw[k] * stand.raw_sigma
+    return residual, J, noise + per_stand @ per_stand.T
+
+
+def _symmetric_root(covariance: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(covariance)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def without(found: Adjusted, touch: int, points: Sequence[float]) -> Adjusted:
+    """The same adjustment with one touch left out; its stand goes too if no other touch is at it."""
+    touches = [t for i, t in enumerate(found.touches) if i != touch]
+    used = sorted({t.stand for t in touches})
+    stands = [found.stands[k] for k in used]
+    return adjust(found.rig, stands, [replace(t, stand=used.index(t.stand)) for t in touches], points)
+
+
+def predicted(found: Adjusted, stand: Stand, touch: Touch) -> np.ndarray:
+    """(3,) where an adjustment puts a touch that it need not hold: what its coordinates should have been."""
+    asked = replace(touch, stand=0)
+    moved = replace(found, stands=(stand,), touches=(asked,))
+    return touch.p_world - _linearised(moved, found.value)[0]
