@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import UsageError
-from pipeline.synthetic import recording, specification
+from pipeline.synthetic import recording, specification, touched_stake
 from pipeline.synthetic.calibration_logs import LOGS
 from pipeline.synthetic.cycle import CYCLE_S, TRAM_S
 from pipeline.synthetic.specification import Specification
 
 SIZES = {"640": (640, 480, 850.0), "1280": (1280, 960, 1731.0)}
+SITES = {**specification.SITES, **touched_stake.SITES}
 SAMPLE_SEED = 17
 FOLDER = Path("sample_logs")
 DRAWN = FOLDER / "generated"
@@ -27,14 +28,16 @@ def specification_of(site: str = "trench", minutes: float | None = None, size: s
 
     Raises UsageError.
     """
-    if site not in specification.SITES:
-        raise UsageError(f"there is no site '{site}': known are {', '.join(specification.SITES)}")
-    spec = specification.SITES[site]()
+    if site not in SITES:
+        raise UsageError(f"there is no site '{site}': known are {', '.join(SITES)}")
+    spec = SITES[site]()
     if size not in SIZES:
         raise UsageError(f"size '{size}' is not known: choose {' or '.join(SIZES)}")
     if spec.size_free and size != "640":
         # More pixels need a finer scale of blur and a better picture; the rest of the site is the same.
         spec = replace(spec.scaled(*SIZES[size]), jpeg_quality=85)
+    if minutes is not None and site in touched_stake.SITES:
+        raise UsageError(f"site '{site}' is as long as its touches take; leave out --minutes")
     if minutes is not None:
         if not 0.3 <= minutes <= 600:
             raise UsageError(f"the length must lie between 0.3 and 600 minutes, found {minutes:g}")
@@ -59,7 +62,8 @@ def make(
     folder
         Left out: ``sample_logs/trench`` for the committed sample, else ``sample_logs/generated/<name>``.
     site
-        ``trench`` or ``other``, or one of `calibration_logs.LOGS`: a log that calibrates the machine of the trench.
+        ``trench`` or ``other``; ``calibration-bucket``; or one of `calibration_logs.LOGS`: a log that calibrates the
+        machine of the trench.
     minutes
         At least this long, in whole cycles; left out, the site's own four cycles.
     size

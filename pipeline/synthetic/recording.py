@@ -20,6 +20,7 @@ from pipeline.synthetic.draws import Uncertainty, file_mounts, uncertainty
 from pipeline.synthetic.excavator import Mounts, raw_reading, true_mounts
 from pipeline.synthetic.renderer import Renderer
 from pipeline.synthetic.specification import SensorPlan, Specification
+from pipeline.synthetic.touching import Touching, check_file
 
 SLICE_FRAMES = 12
 CELL_M = 0.05
@@ -51,8 +52,9 @@ class Shot:
 def world(spec: Specification, seed: int) -> World:
     """The site of a specification and a seed."""
     # Streams are apart, so that another camera or one more cycle does not change every other draw.
-    motion = Motion(spec, np.random.default_rng([seed, 1]))
     built = true_mounts(spec, np.random.default_rng([seed, 2]))
+    streams = np.random.default_rng([seed, 1])
+    motion = Touching(spec, streams, built) if spec.touches else Motion(spec, streams)
     sigma = uncertainty(spec)
     return World(
         spec, seed, built, file_mounts(built, sigma, np.random.default_rng([seed, 3])), sigma, motion
@@ -232,6 +234,8 @@ def _render(piece: list[Shot]) -> list[bytes]:
 
 def _checks(w: World) -> str:
     """Total-station shots: along the finished floor, left, middle and right, and the control point."""
+    if isinstance(w.motion, Touching):
+        return check_file(w.spec, w.motion)
     rng = np.random.default_rng([w.seed, 7])
     floor = truth.dug_floor(w.spec, w.truth, w.motion, CELL_M)
     place = w.motion.place

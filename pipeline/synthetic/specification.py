@@ -10,6 +10,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+from pipeline.synthetic.touch_plan import TouchPlan
+
 
 @dataclass(frozen=True)
 class CameraPlan:
@@ -223,6 +225,8 @@ class Specification:
     )
     """Spectral densities of white-noise acceleration by body, for machine.toml; measured on the motion itself: what
     interpolation between frames misses while digging."""
+    touches: TouchPlan | None = None
+    """Instead of digging: the bucket is set on a stake."""
     size_free: bool = True
     """Whether its cameras may be had with other numbers of pixels."""
 
