@@ -45,6 +45,10 @@ class EstimationError(PipelineError):
     """The adjustment has no usable answer for this log."""
 
 
+class CalibrationError(PipelineError):
+    """A log or a survey cannot tell what it was to calibrate."""
+
+
 class SurfaceError(PipelineError):
     """The design, the alignment or the check shots cannot be used."""
 

@@ -21,10 +21,22 @@ wide (`WIDE`) in every coefficient without a loss of digits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
+from pipeline.calibration.touches import (
+    AXIS,
+    BARS,
+    CURVE_FROM,
+    TOOL,
+    Adjusted,
+    Rig,
+    Stand,
+    Touch,
+    angle_of,
+    powers_of_raw,
+)
 from pipeline.geometry import linkage, se3, so3
 
 WIDE = {"cylinder_m": 2.0, "angle_deg": 400.0}
@@ -33,134 +45,6 @@ HUBER = 2.5
 ITERATIONS = 60
 STEP_SIGMAS = 1e-6
 """The iteration ends with a step smaller than this in prior or posterior standard deviations."""
-AXIS, TOOL, BARS = slice(0, 6), slice(6, 12), slice(12, 21)
-"""Places among the unknowns with a prior; the curve follows, then shared errors, then known points."""
-CURVE_FROM = 21
-
-
-@dataclass(frozen=True, eq=False)
-class Rig:
-    """What machine.toml says of stick, bucket and sensor."""
-
-    axis: np.ndarray
-    """(6, 6) prior covariance of the pin's frame on the stick, right perturbation, the turn about z exact."""
-    T_bucket_tool: np.ndarray
-    """(4, 4)."""
-    tool: np.ndarray
-    """(6, 6) its prior covariance."""
-    width_m: float
-    """Of the cutting edge."""
-    output: str
-    """`cylinder_m`, or `angle_deg` for a sensor without linkage."""
-    coefficients: int
-    """Of the curve."""
-    bars: np.ndarray
-    """(9,) in the order of `linkage.PARAMETERS`, the last one 0; not used for `angle_deg`."""
-    bars_covariance: np.ndarray
-    """(9, 9)."""
-    side: int = 1
-    """Which way round the linkage is built."""
-
-
-@dataclass(frozen=True, eq=False)
-class Stand:
-    """The machine at rest at one bucket angle."""
-
-    name: str
-    T_world_axis: np.ndarray
-    """(4, 4) the pin's frame on the stick, mean over the rest."""
-    own: np.ndarray
-    """(6, 6) what no other stand shares: error along and about the world's axes, m² and rad²."""
-    factors: np.ndarray
-    """(6, r) response to the r independent errors of unit variance that all stands share."""
-    raw: float
-    """Mean reading."""
-    raw_sigma: float
-
-
-@dataclass(frozen=True, eq=False)
-class Touch:
-    """One place of the edge whose coordinates are known."""
-
-    name: str
-    stand: int
-    """Index of the stand; several touches may share one."""
-    p_world: np.ndarray
-    """(3,) metres."""
-    sigma_m: float
-    """Of each coordinate, this touch alone: shot, or how well the tooth sits on the point."""
-    point: int = -1
-    """Index of the known point, whose own error all its touches share; -1 for a shot of its own."""
-    edge_point: str = "middle"
-    """left, middle, right, or empty: anywhere along the edge, and nothing is told along it."""
-
-
-@dataclass(frozen=True, eq=False)
-class Adjusted:
-    """The answer, with everything that is needed to judge it."""
-
-    rig: Rig
-    stands: tuple[Stand, ...]
-    touches: tuple[Touch, ...]
-    middle: float
-    """Raw reading at ``u = 0``."""
-    half: float
-    """Raw unit per unit of ``u``."""
-    value: np.ndarray
-    """(p,) unknowns: axis 6, tool 6, bars 9, curve over u, shared errors, known points 3 each."""
-    covariance: np.ndarray
-    """(p, p)."""
-    residual: np.ndarray
-    """(n, 3) given minus adjusted point, world axes, metres."""
-    J: np.ndarray
-    """(3n, p) of the adjusted points."""
-    noise: np.ndarray
-    """(3n, 3n) covariance of what the unknowns do not explain."""
-    factors: int
-    """Number of shared errors."""
-    pull: float = 0.0
-    """Sum of squares of the unknowns against their priors, the curve's left out."""
-
-    @property
-    def curve(self) -> slice:
-        """Places of the curve's coefficients over u."""
-        return slice(CURVE_FROM, CURVE_FROM + self.rig.coefficients)
-
-    def T_bucket_tool(self) -> np.ndarray:
-        """(4, 4) adjusted."""
-        return se3.retract(self.rig.T_bucket_tool, self.value[TOOL])
-
-    def output(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Cylinder length (m) or angle (deg) at readings (n,), and (n, coefficients) its Jacobian."""
-        powers = self.powers(raw)
-        return powers @ self.value[self.curve], powers
-
-    def powers(self, raw: np.ndarray) -> np.ndarray:
-        """(n, coefficients) powers of u."""
-        u = (np.asarray(raw, float) - self.middle) / self.half
-        return u[..., None] ** np.arange(self.rig.coefficients)
-
-    def angle(self, raw: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Angle of the bucket at readings (n,), radians, nan beyond the bars' reach; and (n, p) its Jacobian."""
-        y, powers = self.output(raw)
-        J = np.zeros((len(y), len(self.value)))
-        angle, J_y, J_bars = angle_of(self.rig, y, self.value[BARS])
-        J[:, BARS] = J_bars
-        J[:, self.curve] = J_y[:, None] * powers
-        return angle, J
-
-    def chi_square(self) -> tuple[float, int]:
-        """Weighted sum of squares of residuals and priors, and the redundancy that it should be near."""
-        v = self.residual.ravel()
-        told = sum(3 if touch.edge_point else 2 for touch in self.touches)
-        return float(v @ np.linalg.solve(self.noise, v)) + self.pull, told - self.rig.coefficients
-
-
-def angle_of(rig: Rig, y: np.ndarray, d_bars: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Angle (n,) of the bucket from what the curve gives, radians, with J_angle_y (n,) and J_angle_bars (n, 9)."""
-    if rig.output == "cylinder_m":
-        return linkage.bucket_angle_with_jacobians(y, rig.bars + d_bars, rig.side)
-    return np.deg2rad(y), np.full(len(y), np.deg2rad(1.0)), np.zeros((len(y), 9))
 
 
 def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: Sequence[float]) -> Adjusted:
@@ -189,24 +73,32 @@ def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: 
     """
     raw = np.array([stand.raw for stand in stands])
     middle, half = 0.5 * (raw.min() + raw.max()), max(0.5 * float(np.ptp(raw)), 1e-12)
-    scale = _prior_scale(rig, stands[0].factors.shape[1], points)
+    shared = stands[0].factors.shape[1]
+    mean, scale = _prior(rig, middle, half, shared, points)
     empty = np.zeros((0, 0))
     found = Adjusted(
-        rig, tuple(stands), tuple(touches), middle, half, np.zeros(len(scale)), empty, np.zeros((0, 3)), empty, empty,
-        stands[0].factors.shape[1],
+        rig, tuple(stands), tuple(touches), middle, half, mean, empty, np.zeros((0, 3)), empty, empty,
+        shared, mean,
     )  # fmt: skip
-    found = replace(found, value=_start(found))
+    if rig.curve is None:
+        found = replace(found, value=_start(found))
     robust = _iterate(found, scale, huber=True)
     return _iterate(robust, scale, huber=False)
 
 
-def _prior_scale(rig: Rig, factors: int, points: Sequence[float]) -> np.ndarray:
-    """(p, q) square root of the prior covariance, without columns for what is exact."""
+def _prior(
+    rig: Rig, middle: float, half: float, factors: int, points: Sequence[float]
+) -> tuple[np.ndarray, np.ndarray]:
+    """(p,) means and (p, q) square root of the prior covariance, without columns for what is exact."""
+    curve_mean, curve_root = np.zeros(rig.coefficients), np.eye(rig.coefficients) * WIDE[rig.output]
+    if rig.curve is not None:
+        to_u = np.linalg.inv(powers_of_raw(rig.coefficients, middle, half))
+        curve_mean, curve_root = to_u @ rig.curve[0], _root(to_u @ rig.curve[1] @ to_u.T)
     blocks = [
         _root(rig.axis),
         _root(rig.tool),
         _root(rig.bars_covariance if rig.output == "cylinder_m" else np.zeros((9, 9))),
-        np.eye(rig.coefficients) * WIDE[rig.output],
+        curve_root,
         np.eye(factors),
         *[np.eye(3) * sigma for sigma in points],
     ]
@@ -215,7 +107,9 @@ def _prior_scale(rig: Rig, factors: int, points: Sequence[float]) -> np.ndarray:
     for block in blocks:
         scale[row : row + block.shape[0], column : column + block.shape[1]] = block
         row, column = row + block.shape[0], column + block.shape[1]
-    return scale
+    mean = np.zeros(len(scale))
+    mean[CURVE_FROM : CURVE_FROM + rig.coefficients] = curve_mean
+    return mean, scale
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
@@ -275,9 +169,9 @@ def _on_tool(rig: Rig, touch: Touch, along_m: float) -> np.ndarray:
 
 
 def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
-    """Gauss-Newton on ``value = scale z`` with ``z ~ N(0, I)`` and the curve's prior about zero, nearly flat."""
+    """Gauss-Newton on ``value = mean + scale z`` with ``z ~ N(0, I)``; a curve that is asked for has it nearly flat."""
     value = found.value
-    z = np.linalg.lstsq(scale, value, rcond=None)[0]
+    z = np.linalg.lstsq(scale, value - found.mean, rcond=None)[0]
     weight = np.ones(len(found.touches))
     for _ in range(ITERATIONS):
         residual, J, noise = _linearised(found, value)
@@ -292,7 +186,7 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
         while ahead > 1e-3 and not _reaches(found, value + ahead * (scale @ step)):
             ahead *= 0.5
         z = z + ahead * step
-        value = scale @ z
+        value = found.mean + scale @ z
         size = float(np.sqrt(step @ normal @ step))
         if huber:
             before = weight
@@ -308,7 +202,7 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
     A = J @ scale
     normal = A.T @ np.linalg.solve(noise, A) + np.eye(scale.shape[1])
     covariance = scale @ np.linalg.solve(normal, scale.T)
-    of_curve = np.any(scale[found.curve] != 0, axis=0)
+    flat = np.any(scale[found.curve] != 0, axis=0) & (found.rig.curve is None)
     return replace(
         found,
         value=value,
@@ -316,7 +210,7 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
         residual=residual.reshape(-1, 3),
         J=J,
         noise=noise,
-        pull=float(np.sum(z[~of_curve] ** 2)),
+        pull=float(np.sum(z[~flat] ** 2)),
     )
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.calibration.bucket import BARS, TOOL, Adjusted, Rig, angle_of
+from pipeline.calibration.touches import TOOL, Adjusted, Rig, angle_of, powers_of_raw
 from pipeline.geometry import linkage, se3, so3
 
 MOST_COEFFICIENTS = 5
@@ -131,7 +131,7 @@ def written(found: Adjusted) -> Written:
             break
     assert fitted is not None
     c, covariance, misfit, off = fitted
-    to_raw = _powers_of_raw(len(c), found.middle, found.half)
+    to_raw = powers_of_raw(len(c), found.middle, found.half)
     T_tool, tool = _held_tool(found, held)
     return Written(
         to_raw @ c,
@@ -178,27 +178,3 @@ def _held_tool(found: Adjusted, held: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _whole_turns(angle: np.ndarray) -> np.ndarray:
     return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-
-def _powers_of_raw(count: int, middle: float, half: float) -> np.ndarray:
-    """(count, count) takes coefficients of powers of ``(raw - middle) / half`` to those of powers of ``raw``."""
-    rows = [np.array([1.0])]
-    for _ in range(count - 1):
-        rows.append(np.polynomial.polynomial.polymul(rows[-1], [-middle / half, 1.0 / half]))
-    out = np.zeros((count, count))
-    for k, row in enumerate(rows):
-        out[: len(row), k] = row
-    return out
-
-
-__all__ = [
-    "BARS",
-    "Direction",
-    "Written",
-    "azimuth_of",
-    "direction",
-    "monotone",
-    "of_file",
-    "radius",
-    "written",
-]

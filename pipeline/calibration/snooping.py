@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.stats import norm
 
-from pipeline.calibration.bucket import Adjusted
+from pipeline.calibration.touches import Adjusted
 
 RISK = 1e-3
 """That any of the coordinates is named though none is wrong."""

@@ -119,7 +119,7 @@ def stand_at(
     epochs = epochs[(stamps >= centre - half) & (stamps <= centre + half)]
     span_s = (edge.time_ns[epochs[-1]] - edge.time_ns[epochs[0]]) * 1e-9
     common = _square(edge.common[epochs].mean(axis=0))
-    own = _square((edge.cov[epochs] - edge.common[epochs]).mean(axis=0)) * _share_left(span_s, correlation_s)
+    own = _square((edge.cov[epochs] - edge.common[epochs]).mean(axis=0)) * share_left(span_s, correlation_s)
     middle = int(epochs[len(epochs) // 2])
     return Stand(int(edge.time_ns[middle]), edge.p_grid[epochs].mean(axis=0), own, common)
 
@@ -151,7 +151,8 @@ def _away(p: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.sqrt(((p - q) ** 2).sum(axis=-1)).max(axis=-1)
 
 
-def _share_left(span_s: float, tau_s: float | None) -> float:
+def share_left(span_s: float, tau_s: float | None) -> float:
+    """Share of the own variance of one epoch that a mean over a span keeps; see `stand_at`."""
     if tau_s is None or tau_s <= 0 or span_s <= 0:
         return 1.0
     x = span_s / tau_s

@@ -7,13 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TouchPlan:
-    """A stake in front of the machine, and how the bucket is set on it."""
+    """A stake in a shallow pit in front of the machine, and how the bucket is set on it: low, so that the camera
+    sees the board on the stick in every touch."""
 
     directions_deg: tuple[float, ...]
     """From the bucket's pin to its edge, above the horizontal, touch by touch."""
-    reach: float = 5.9
+    reach: float = 5.8
     """Of the stake from the swing axis, metres."""
-    height: float = 1.2
+    height: float = -0.25
     """Of its top above the ground."""
     name: str = "TP1"
     hold_s: float = 2.2

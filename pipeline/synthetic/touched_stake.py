@@ -27,7 +27,7 @@ def calibration_bucket() -> Specification:
         cycles=1,
         utilities=(),
         sigmas=taped,
-        touches=TouchPlan(directions_deg=(-180.0, -162.0, -144.0, -126.0, -109.0, -93.0, -78.0, -64.0)),
+        touches=TouchPlan(directions_deg=(-178.0, -163.0, -148.0, -133.0, -117.0, -101.0, -86.0, -72.0)),
     )
 
 
