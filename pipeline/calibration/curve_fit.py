@@ -80,13 +80,16 @@ def azimuth_of(T_bucket_tool: np.ndarray) -> tuple[float, np.ndarray]:
     return float(np.arctan2(y, x)), np.concatenate([J_azimuth_p @ T_bucket_tool[:3, :3], np.zeros(3)])
 
 
-def radius(found: Adjusted) -> tuple[float, float]:
-    """Distance from the pin to the middle of the edge in the plane of the bucket, and its sigma, metres."""
+def radius_with_jacobian(found: Adjusted) -> tuple[float, float, np.ndarray]:
+    """Distance from the pin to the middle of the edge in the plane of the bucket, its sigma, metres, and its (p,)
+    Jacobian.
+    """
     T = found.T_bucket_tool()
     x, y = T[:2, 3]
     r = float(np.hypot(x, y))
-    J = np.concatenate([np.array([x, y, 0.0]) / r @ T[:3, :3], np.zeros(3)]) @ se3.Jr(found.value[TOOL])
-    return r, float(np.sqrt(J @ found.covariance[TOOL, TOOL] @ J))
+    J = np.zeros(len(found.value))
+    J[TOOL] = np.concatenate([np.array([x, y, 0.0]) / r @ T[:3, :3], np.zeros(3)]) @ se3.Jr(found.value[TOOL])
+    return r, float(np.sqrt(J @ found.covariance @ J)), J
 
 
 def written(found: Adjusted) -> Written:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 from pipeline.cli.intrinsics import intrinsics
+from pipeline.cli.bucket import bucket
 
 
 @click.group()
@@ -13,3 +14,4 @@ def calibrate() -> None:
 
 
 calibrate.add_command(intrinsics)
+calibrate.add_command(bucket)

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 @dataclass(frozen=True)
 class TouchPlan:
     """A stake in a shallow pit in front of the machine, and how the bucket is set on it: low, so that the camera
-    sees the board on the stick in every touch."""
+    sees the board on the stick in every touch.
+    """
 
     directions_deg: tuple[float, ...]
     """From the bucket's pin to its edge, above the horizontal, touch by touch."""

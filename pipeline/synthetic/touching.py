@@ -22,7 +22,9 @@ class Touching(Motion):
     """The machine stands; its edge goes from touch to touch. The soil is the stake's: what is set down stays."""
 
     def __init__(self, spec: Specification, rng: np.random.Generator, mounts: Mounts):
-        self._mounts = mounts
+        self._aim: np.ndarray
+        self._turned: np.ndarray
+        self._tip: BPoly
         super().__init__(spec, rng)
         plan = spec.touches
         assert plan is not None

@@ -1,0 +1,202 @@
+"""What `calibrate bucket` takes from the two files and the surveyor's, and what it puts into machine.toml."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.calibration import curve_fit
+from pipeline.calibration.touches import Rig
+from pipeline.config import Machine, Site
+from pipeline.config.machine import JointBody
+from pipeline.config.quantities import Pose
+from pipeline.errors import CalibrationError
+from pipeline.geometry import so3
+from pipeline.network import network_of
+from pipeline.report.bucket_sheet import BucketFacts
+from pipeline.stages.calibrated import provenance
+from pipeline.surface.parked import KnownPoint
+from pipeline.surface.shots import Shots, read_shots
+
+COMMAND = "gradetrace calibrate bucket"
+WEAR_SIGMA_M = 0.2
+
+
+def rig_of(machine: Machine, site: Site, name: str, date: datetime.date, wear: bool) -> Rig:
+    """Priors of the adjustment, as the network has them; with `wear` the curve is held and the wear is free."""
+    network = network_of(machine, site, date)
+    sensor = next(s for s in network.sensors if s.name == name)
+    curve = network.statics[sensor.curve]
+    bars = None if sensor.linkage is None else network.statics[sensor.linkage]
+    tool = network.statics[network.tool]
+    axis_index = network.bodies[sensor.joint].static
+    assert axis_index is not None
+    axis = network.statics[axis_index].covariance.copy()
+    bars_covariance = np.zeros((9, 9)) if bars is None else bars.covariance.copy()
+    if not wear:
+        # Where the axis frame's x points is what angle zero means; what is not known of it is the curve's to absorb.
+        bars_covariance[7, 7] += axis[5, 5]
+        axis[5, :] = axis[:, 5] = 0.0
+    tool_covariance = tool.covariance.copy()
+    if wear:
+        tool_covariance[2, 2] += WEAR_SIGMA_M**2
+    return Rig(
+        axis,
+        tool.value,
+        tool_covariance,
+        network.edge_m,
+        sensor.output,
+        len(curve.value),
+        np.zeros(9) if bars is None else bars.value,
+        bars_covariance,
+        sensor.side,
+        (curve.value, curve.covariance) if wear else None,
+    )
+
+
+def values_of(
+    machine: Machine, joint: str, name: str, kept: curve_fit.Written, facts: BucketFacts
+) -> dict[str, Any]:
+    """Dotted keys and values for machine.toml."""
+    body = machine.bodies[joint]
+    assert isinstance(body, JointBody)
+    by = {"by": COMMAND, "sha256": facts.log_sha256}
+    source = provenance(facts.date, COMMAND, Path(facts.log), by["sha256"])
+    curve = machine.sensors[name].curve
+    values: dict[str, Any] = {
+        f"sensors.{name}.curve": {
+            "output": curve.output,
+            "coefficients": kept.coefficients,
+            "covariance": kept.covariance,
+            "raw_range": list(kept.raw_range),
+            "calibrated": {**source, "raw_range": list(kept.stroke)},
+        },
+        "cutting_edge.mount": {
+            "xyz_m": kept.T_bucket_tool[:3, 3],
+            "rpy_deg": so3.to_rpy_deg(kept.T_bucket_tool[:3, :3]),
+            "covariance": kept.tool,
+            "calibrated": source,
+        },
+        f"bodies.{joint}.axis": _without_turn(body.axis),
+    }
+    if machine.sensors[name].linkage is not None:
+        values[f"sensors.{name}.linkage.sigma_mm"] = 0.0
+        values[f"sensors.{name}.linkage.sigma_horn_angle_deg"] = 0.0
+    if machine.cutting_edge.wear:
+        values["cutting_edge.wear"] = None  # what was touched with were the teeth as they are now
+    return values
+
+
+def wear_values(machine: Machine, facts: BucketFacts) -> dict[str, Any]:
+    """The wear of the day of the log, with those before and after.
+
+    Raises
+    ------
+    CalibrationError
+        The teeth are longer than the file's mount says.
+    """
+    assert facts.wear_m is not None
+    sigma_m = facts.wear_sigma_m
+    if facts.wear_m < -2 * sigma_m:
+        raise CalibrationError(
+            f"the teeth reach {-1000 * facts.wear_m:.1f} mm further than cutting_edge.mount says (sigma "
+            f"{1000 * sigma_m:.1f} mm), which is no wear; calibrate the bucket without --wear"
+        )
+    entries = [
+        {"date": w.date, "wear_mm": w.wear_mm, "sigma_mm": w.sigma_mm}
+        for w in machine.cutting_edge.wear
+        if w.date != facts.date
+    ]
+    entries.append(
+        {
+            "date": facts.date,
+            "wear_mm": round(max(1000 * facts.wear_m, 0.0), 2),
+            "sigma_mm": round(1000 * sigma_m, 2),
+        }
+    )
+    return {"cutting_edge.wear": sorted(entries, key=lambda entry: str(entry["date"]))}
+
+
+def worn_m(machine: Machine, date: datetime.date) -> float:
+    entries = sorted((w for w in machine.cutting_edge.wear if w.date <= date), key=lambda w: w.date)
+    return entries[-1].wear_mm / 1000 if entries else 0.0
+
+
+def _without_turn(axis: Pose) -> dict[str, Any]:
+    """The same axis, exact about its own z."""
+    same: dict[str, Any] = {"xyz_m": list(axis.xyz_m), "rpy_deg": list(axis.rpy_deg)}
+    if axis.covariance is not None:
+        covariance = np.array(axis.covariance)
+        covariance[5, :] = covariance[:, 5] = 0.0
+        same["covariance"] = covariance
+    else:
+        assert axis.sigma_mm is not None and axis.sigma_deg is not None
+        sigma = np.broadcast_to(axis.sigma_deg, 3)
+        same["sigma_mm"] = (
+            list(axis.sigma_mm) if isinstance(axis.sigma_mm, Sequence) else float(axis.sigma_mm)
+        )
+        same["sigma_deg"] = [float(sigma[0]), float(sigma[1]), 0.0]
+    if axis.calibrated is not None:
+        same["calibrated"] = axis.calibrated.model_dump(mode="python", exclude_defaults=True)
+    return same
+
+
+def points_of(
+    checks_file: Path | None, point_text: str | None, site: Site
+) -> tuple[Shots, dict[str, KnownPoint]]:
+    """Rows of the file, and known points of site.toml and of the option."""
+    scale = site.grid.metres_per_unit
+    checks = site.checks
+    sigma_m = (2.0 if checks is None else checks.sigma_mm) / 1000
+    known = {
+        key: KnownPoint(np.array(point.enh) * scale, point.sigma_mm / 1000)
+        for key, point in (checks.control.items() if checks is not None else ())
+    }
+    shots = Shots(np.zeros(0, object), np.zeros(0, object), np.zeros((0, 3)))
+    if checks_file is not None:
+        shots = read_shots(
+            checks_file,
+            "named" if checks is None else _order(checks_file, checks.order),
+            scale,
+            site.report.time_zone,
+            None if checks is None else checks.codes,
+        )
+    if point_text is not None:
+        parts = point_text.split(",")
+        if len(parts) == 3:
+            try:
+                enh = np.array([float(part) for part in parts])
+            except ValueError:
+                raise CalibrationError(f"--point {point_text}: write E,N,H as three numbers") from None
+            known = {"point": KnownPoint(enh * scale, sigma_m)}
+        elif point_text in known:
+            known = {point_text: known[point_text]}
+        else:
+            row = np.flatnonzero(shots.point.astype(str) == point_text)
+            if not len(row):
+                raise CalibrationError(
+                    f"--point {point_text}: no such point among the known points of site.toml, and no such row in "
+                    f"the file; give E,N,H in the grid unit, or one of {', '.join(known) or 'none'}"
+                )
+            sigma = float(shots.sigma_m[row[0]])
+            known = {point_text: KnownPoint(shots.p_grid[row[0]], sigma if np.isfinite(sigma) else sigma_m)}
+    if not len(shots) and not known:
+        raise CalibrationError(
+            "no point is known that the edge touched: give a check file, --point E,N,H, or [checks.control] in "
+            "site.toml"
+        )
+    return shots, known
+
+
+def _order(file: Path, order: str) -> str:
+    """A file with headings says itself what its columns are."""
+    try:
+        first = file.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff").splitlines()[:1]
+    except OSError:
+        return order
+    words = {word.strip().lower() for word in first[0].replace(";", ",").split(",")} if first else set()
+    return "named" if {"northing", "easting"} <= words else order

@@ -1,0 +1,200 @@
+"""``gradetrace calibrate bucket``: touches of a known point -> curve, cutting edge, wear in machine.toml; a sheet."""
+
+from __future__ import annotations
+
+import datetime
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.calibration.agreement import agreed, kept_of
+from pipeline.calibration.touches import TOOL
+from pipeline.config import Machine, Site
+from pipeline.errors import CalibrationError, ConfigError
+from pipeline.estimation.table import sensitivities_from_columns
+from pipeline.report.bucket_sheet import BucketFacts, bucket_sheet
+from pipeline.runs import RunFolder
+from pipeline.stages import stage_named
+from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
+from pipeline.stages.calibrated import put_into, put_sheet
+from pipeline.stages.job import Job, check_log_file, describe
+from pipeline.stages.runner import Watch, plan, run_stage
+from pipeline.stages.touched import RULE, Touched, machine_to_the_pin, standings, touched
+from pipeline.surface.rests import rests_of
+from pipeline.tracks.table import cutting_edge_from_columns, states_from_columns
+
+STAGES = ("ingest", "detect", "estimate", "track")
+SHARE_OF_TOLERANCE = 1 / 3
+"""Of the job's tolerance that the bucket may use up, at k = 2."""
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the command was asked for."""
+
+    log: Path
+    checks: Path | None = None
+    machine: Path | None = None
+    site: Path | None = None
+    runs: Path = Path("runs")
+    point: str | None = None
+    """Id, or E,N,H in the grid unit."""
+    tooth: str = "middle"
+    """left, middle, right or any."""
+    sensor: str | None = None
+    contact_mm: float = 1.0
+    wear: bool = False
+    workers: int = 1
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What was done."""
+
+    facts: BucketFacts
+    sentence: str
+    kept: Path
+    machine_file: Path
+    sheet: Path
+
+
+def calibrate_bucket(wanted: Wanted, watch: Watch) -> Calibrated:
+    """Calibrate, write machine.toml and the sheet; nothing is written where anything is wrong.
+
+    Raises
+    ------
+    CalibrationError
+        Too few touches, a touch that contradicts the others, a curve that turns back.
+    PipelineError
+        The log, a description or a stage is at fault.
+    """
+    check_log_file(wanted.log)
+    machine, machine_source, site, site_source = describe(wanted.log, wanted.machine, wanted.site)
+    if machine_source.origin == "attachment":
+        raise ConfigError(
+            f"{wanted.log} has only the machine.toml inside it, and nothing can be written there; put one beside the "
+            "log, or name it with --machine"
+        )
+    machine_file = wanted.machine or wanted.log.parent / "machine.toml"
+    name = sensor_of(machine, wanted.sensor)
+    reduced, joint = machine_to_the_pin(machine)
+    # Of its own: in runs/<log> the tables are those of the whole machine.
+    folder = RunFolder(wanted.runs / f"{wanted.log.stem}-bucket")
+    folder.create()
+    job = Job(
+        log=wanted.log,
+        log_sha256=folder.hash_file(wanted.log),
+        folder=folder,
+        machine=machine,
+        site=site,
+        machine_source=machine_source,
+        site_source=site_source,
+        files={},
+        workers=wanted.workers,
+    )
+    with folder.locked():
+        for stage_name in STAGES:
+            stage = stage_named(stage_name)
+            here = job if stage_name == "ingest" else replace(job, machine=reduced)
+            now = plan(here, stage)
+            why = folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
+            if why is not None:
+                run_stage(here, stage, now, watch, why)
+            manifest = folder.manifest(stage.name)
+            assert manifest is not None
+            watch.done(stage, manifest, ran=why is not None)
+        found = _touched(job, wanted, machine, site, name)
+        reader = job.at(stage_named("report"), "")
+        start_ns = int(reader.read_json("log.json")["start_ns"])
+        date = datetime.datetime.fromtimestamp(start_ns / 1e9, datetime.UTC).date()
+        rig = rig_of(job.calibrated_machine(), site, name, date, wanted.wear)
+        points = dict(zip(found.point_names, found.points))
+        adjusted = agreed(rig, found.stands, found.touches, points, found.left_out)
+        kept = None if wanted.wear else kept_of(adjusted, name)
+        facts = BucketFacts(
+            machine=f"{machine.machine.id}",
+            sensor=name,
+            adjusted=adjusted,
+            kept=kept,
+            touch_names=tuple(t.name for t in adjusted.touches),
+            point_names=tuple(found.point_names),
+            left_out=found.left_out,
+            wear_m=None if kept else float(worn_m(machine, date) - adjusted.value[TOOL][2]),
+            tolerance_m=min(site.tolerance.high_mm, site.tolerance.low_mm) / 1000 * SHARE_OF_TOLERANCE,
+            date=date,
+            log=wanted.log.name,
+            log_sha256=job.log_sha256,
+            checks=None if wanted.checks is None else wanted.checks.name,
+            machine_sha256=machine_source.sha256,
+        )
+        values = wear_values(machine, facts) if kept is None else values_of(machine, joint, name, kept, facts)
+        sheet, page = folder.file("bucket.html"), bucket_sheet(facts)
+        put_sheet(page, sheet)
+        before = put_into(machine_file, "machine", values)
+    return Calibrated(facts, page.sentence, before, machine_file, sheet)
+
+
+def sensor_of(machine: Machine, asked: str | None) -> str:
+    """The bucket's sensor. Raises CalibrationError where there is none, or several and none was named."""
+    joint = machine.cutting_edge.body
+    names = [name for name, sensor in machine.sensors.items() if sensor.joint == joint]
+    if asked is not None:
+        if asked not in names:
+            raise CalibrationError(
+                f"--sensor {asked}: no sensor of that name reads the joint '{joint}'; there is "
+                f"{', '.join(names) or 'none'}"
+            )
+        return asked
+    if not names:
+        raise CalibrationError(
+            f"machine.toml has no sensor that reads the bucket's joint '{joint}'; add [sensors.<name>]"
+        )
+    if len(names) > 1:
+        raise CalibrationError(
+            f"{len(names)} sensors read the joint '{joint}': name one with --sensor ({', '.join(names)})"
+        )
+    return names[0]
+
+
+def _touched(job: Job, wanted: Wanted, machine: Machine, site: Site, name: str) -> Touched:
+    reader = job.at(stage_named("report"), "")
+    states = states_from_columns(reader.read_table("states"))
+    edge = cutting_edge_from_columns(reader.read_table("cutting_edge"))
+    rests = rests_of(edge, RULE)
+    lasting = reader.read_json("solution.json").get("correlation_time_s") or {}
+    answer = sensitivities_from_columns(reader.read_table("sensitivities"))
+    sensors = reader.read_table("sensors")
+    rows = sensors["sensor"].astype(str) == name
+    sensor = machine.sensors[name]
+    stamps = sensors["time_ns"][rows] + round(sensor.time_offset_s * 1e9)
+    if not np.any(rows):
+        raise CalibrationError(
+            f"{wanted.log.name} has no reading of sensor '{name}' on {sensor.topic}; record it with the touches"
+        )
+    stands = standings(
+        states,
+        rests,
+        edge.time_ns,
+        answer,
+        lasting.get("parked", lasting.get("median")),
+        stamps,
+        sensors["raw"][rows],
+        sensor.noise,
+    )
+    checks = site.checks
+    shots, known = points_of(wanted.checks, wanted.point, site)
+    mount = np.array(machine.cutting_edge.mount.xyz_m)
+    return touched(
+        stands,
+        shots,
+        known,
+        site.grid.to_grid_metres(np.zeros(3)),
+        float(np.hypot(mount[0], mount[1])),
+        machine.cutting_edge.width_m,
+        0.15 if checks is None else checks.control_radius_m,
+        5.0 if checks is None else checks.time_tolerance_s,
+        (2.0 if checks is None else checks.sigma_mm) / 1000,
+        wanted.contact_mm / 1000,
+        "" if wanted.tooth == "any" else wanted.tooth,
+    )
