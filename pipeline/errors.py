@@ -55,7 +55,3 @@ class SurfaceError(PipelineError):
 
 class ArtefactError(PipelineError):
     """A file of the run folder is missing, damaged or of another version."""
-
-
-class CalibrationError(PipelineError):
-    """What was recorded does not tell what is to be calibrated."""

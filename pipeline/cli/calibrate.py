@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import click
 
-from pipeline.cli.intrinsics import intrinsics
 from pipeline.cli.bucket import bucket
+from pipeline.cli.intrinsics import intrinsics
 
 
 @click.group()

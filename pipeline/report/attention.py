@@ -63,6 +63,7 @@ def attention(
             for sentence in tell(inputs, units, words)
         ),
         *_of_checks(inputs, words, statistics),
+        *_of_stroke(inputs, words),
         *_of_network(inputs, words),
         *_of_coverage(inputs, words, timeline),
         *(Remark(SERIOUS, sentence, "detector") for sentence in detector.shaken(inputs, words)),
@@ -237,6 +238,28 @@ def _of_checks(inputs: ReportInputs, words: Words, statistics: dict[str, Number]
     if value is not None and value > CHI_SQUARE_HIGH:
         remarks.append(Remark(SERIOUS, words("attention.chi_square", value=text_of(value, 2)), "checks"))
     return remarks
+
+
+def _of_stroke(inputs: ReportInputs, words: Words) -> list[Remark]:
+    """Sensors that were read where their curve is only extrapolated."""
+    return [
+        Remark(
+            SERIOUS,
+            words(
+                "attention.beyond_stroke",
+                sensor=name,
+                n=found["beyond"],
+                all=found["readings"],
+                low=text_of(found["stroke"][0], 3),
+                high=text_of(found["stroke"][1], 3),
+                least=text_of(found["least"], 3),
+                most=text_of(found["most"], 3),
+                date=found["calibrated"],
+            ),
+            "provenance",
+        )
+        for name, found in (inputs.solution.get("beyond_stroke") or {}).items()
+    ]
 
 
 def _of_network(inputs: ReportInputs, words: Words) -> list[Remark]:

@@ -84,9 +84,10 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
                 column("age", words("columns.age"), words("provenance.days"), 0),
                 column("by", words("columns.by")),
                 column("source", words("columns.calibrated_from"), kind="id"),
+                column("beyond", words("provenance.used_beyond")),
                 column("sha256", words("columns.sha256"), kind="code"),
             ],
-            list(_calibrations(inputs)),
+            list(_calibrations(inputs, words)),
         ),
         "stages": numbers.table(
             stage_columns,
@@ -101,10 +102,14 @@ def provenance(inputs: ReportInputs, words: Words) -> dict[str, Any]:
     }
 
 
-def _calibrations(inputs: ReportInputs) -> Iterator[dict[str, Any]]:
+def _calibrations(inputs: ReportInputs, words: Words) -> Iterator[dict[str, Any]]:
     """A row per quantity of the two files that says when it was told; its age is that on the day of the log."""
     start_ns = inputs.log_facts.get("start_ns")
     day = None if not start_ns else datetime.datetime.fromtimestamp(start_ns / 1e9, datetime.UTC).date()
+    beyond = {
+        f"sensors.{name}.curve": words("provenance.beyond", n=found["beyond"], all=found["readings"])
+        for name, found in (inputs.solution.get("beyond_stroke") or {}).items()
+    }
     for key, told in [*calibrated_in(inputs.machine), *calibrated_in(inputs.site)]:
         yield {
             "what": key,
@@ -112,5 +117,6 @@ def _calibrations(inputs: ReportInputs) -> Iterator[dict[str, Any]]:
             "age": None if day is None else (day - told.date).days,
             "by": told.by,
             "source": told.source,
+            "beyond": beyond.get(key, ""),
             "sha256": told.sha256,
         }

@@ -8,10 +8,13 @@ import datetime
 import logging
 import time
 import zipfile
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from pipeline.config import Machine
 from pipeline.estimation import adjust
 from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.table import (
@@ -24,6 +27,7 @@ from pipeline.estimation.table import (
 )
 from pipeline.logs.clock import EARLIEST_NS
 from pipeline.network import network_of
+from pipeline.network.model import Readings
 from pipeline.runs import atomic_file
 from pipeline.stages.job import Counts, Job, Progress
 
@@ -57,7 +61,8 @@ def run(job: Job, progress: Progress) -> Counts:
     with job.table_writer("sensitivities") as writer:
         for portion in () if answer is None else answer.portions(PORTION_EPOCHS):
             writer.write(columns_of_sensitivities(portion))
-    job.write_json("solution.json", solution.diagnostics)
+    beyond = beyond_stroke(job.machine, readings)
+    job.write_json("solution.json", {**solution.diagnostics, "beyond_stroke": beyond})
     progress.advance(1)
     for sentence in solution.warnings:
         progress.warn(sentence)
@@ -77,10 +82,46 @@ def run(job: Job, progress: Progress) -> Counts:
         ),
         "corners rejected": int((solution.residuals.weight == 0).sum()),
         "readings": {name: len(r.raw) for name, r in readings.items()},
+        **(
+            {"readings beyond the calibrated stroke": {n: f["beyond"] for n, f in beyond.items()}}
+            if beyond
+            else {}
+        ),
         "left out": figures["dropped"],
         "iterations": figures["iterations"],
         "sigma0": figures["sigma0"],
     }
+
+
+def beyond_stroke(machine: Machine, readings: Mapping[str, Readings]) -> dict[str, dict[str, Any]]:
+    """Sensors that read where their curve was never calibrated: how many of the readings, and how far they went.
+
+    Parameters
+    ----------
+    machine : Machine
+        A curve without a calibrated stroke says nothing.
+    readings : mapping
+        As recorded, those that the adjustment drops as well.
+    """
+    found = {}
+    for name, sensor in machine.sensors.items():
+        calibrated = sensor.curve.calibrated
+        if calibrated is None or calibrated.raw_range is None or name not in readings:
+            continue
+        low, high = calibrated.raw_range
+        raw = readings[name].raw
+        raw = raw[np.isfinite(raw)]
+        beyond = int(np.count_nonzero((raw < low) | (raw > high)))
+        if beyond:
+            found[name] = {
+                "readings": len(raw),
+                "beyond": beyond,
+                "stroke": [low, high],
+                "least": float(raw.min()),
+                "most": float(raw.max()),
+                "calibrated": calibrated.date.isoformat(),
+            }
+    return found
 
 
 class Scratch:

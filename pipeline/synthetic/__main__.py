@@ -23,9 +23,7 @@ def main(arguments: list[str] | None = None) -> None:
         description="Render logs of a site whose truth is known. Without options: the committed sample and the "
         f"{DRAWN_LOGS} drawn 1280x960 logs of {DRAWN_MINUTES:g} minutes that the benchmarks use.",
     )
-    parser.add_argument(
-        "--site", choices=(*command.SITES, *LOGS), help="which site; one log of it is made"
-    )
+    parser.add_argument("--site", choices=(*command.SITES, *LOGS), help="which site; one log of it is made")
     parser.add_argument("--size", choices=tuple(command.SIZES), help="640 (640x480) or 1280 (1280x960)")
     parser.add_argument("--minutes", type=float, help="at least this long, in whole cycles")
     parser.add_argument(
