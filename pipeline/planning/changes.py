@@ -143,6 +143,7 @@ def best_place(setup: Setup, work: Postures, candidates, benchmark: str) -> tupl
     Parameters
     ----------
     setup : Setup
+        As it is.
     work : Postures
         A few dozen of the work.
     candidates : (k, 3) array
@@ -164,7 +165,9 @@ def best_place(setup: Setup, work: Postures, candidates, benchmark: str) -> tupl
     for p in np.asarray(candidates, float):
         T = facing_print(p, towards)
         network = with_benchmark(setup.network, T, benchmark)
-        places.append(Place(T, benchmark, gain_of("one more benchmark", replace(setup, network=network), work)))
+        places.append(
+            Place(T, benchmark, gain_of("one more benchmark", replace(setup, network=network), work))
+        )
     return min(places, key=lambda place: place.gain.score_m), places
 
 

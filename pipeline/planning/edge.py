@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.linalg
 
 from pipeline.estimation.repeated import SOURCE as CORNERS
 from pipeline.geometry import se3
@@ -34,7 +33,7 @@ class EdgePlan:
     common: np.ndarray
     """(n, 3, 3)."""
     by_source: dict[str, np.ndarray]
-    """(n,) variance of the elevation from the priors of each source; ``MEASUREMENTS`` is the rest of the common part."""
+    """(n,) variance of the elevation through the priors of each source; ``MEASUREMENTS`` is the common part's rest."""
 
     @property
     def total(self) -> np.ndarray:
@@ -52,6 +51,7 @@ def edge_plan(found: Looks, S, looking: Looking, densities: dict[str, tuple] | N
     Parameters
     ----------
     found : Looks
+        One at each posture.
     S : (p, p) array
         Of ``Looks.statics_information``, over the looks of the whole shift or of one.
     looking : Looking
@@ -61,8 +61,8 @@ def edge_plan(found: Looks, S, looking: Looking, densities: dict[str, tuple] | N
         those of machine.toml.
     """
     T, L_x, L_s = _edge_maps(found)
-    n, b = found.H_xx.shape[:2]
-    P_zz = scipy.linalg.cho_solve(scipy.linalg.cho_factor(S), np.eye(len(S)))
+    n = len(found.H_xx)
+    P_zz = np.linalg.inv(S)  # never worse conditioned than its priors: S >= I
     groups = {
         source: np.concatenate(
             [found.statics.columns[k] for k, s in enumerate(found.network.statics) if s.source == source]
@@ -129,7 +129,8 @@ def _smoothed(found: Looks, looking: Looking, densities) -> np.ndarray:
             acceleration.append(a)
             shake.append(v)
         H = found.H_xx[:, index[:, None], index]
-        dt_s, at = looking.frame_s, BETWEEN_LOOKS
+        dt_s = looking.frame_s
+        at: tuple[float, ...] = BETWEEN_LOOKS
         if all(found.tie.variables[k].kind == "joint" for k in chain) and not _pictured(found, chain):
             # Read by its sensor alone: so often is it looked at.
             H, dt_s, at = H / looking.readings_per_look, dt_s / looking.readings_per_look, (0.0,)
@@ -140,4 +141,5 @@ def _smoothed(found: Looks, looking: Looking, densities) -> np.ndarray:
 
 
 def _pictured(found: Looks, chain) -> bool:
-    return any(J.variables.keys() & set(chain) and next(iter(J.variables.values())).shape[1] == 8 for _, J in found.groups)
+    told = [J.variables for _, J in found.groups if J.variables.keys() & set(chain)]
+    return any(next(iter(by.values())).shape[1] == 8 for by in told)  # of eight residuals: a tag's corners

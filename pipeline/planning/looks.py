@@ -6,7 +6,7 @@ pictures are those that the postures would give. So whatever the adjustment can 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -40,7 +40,7 @@ class Looking:
     readings_per_look: float = 4.0
     """Of a joint's sensor, between two frames."""
     repeated: Repeated = WHITE
-    noise: CornerNoise = CornerNoise()
+    noise: CornerNoise = field(default_factory=CornerNoise)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,7 +90,12 @@ class Looks:
 
 
 def looks(
-    network: Network, postures: Postures, sight: Sight, looking: Looking, share=None, like: Network | None = None
+    network: Network,
+    postures: Postures,
+    sight: Sight,
+    looking: Looking,
+    share=None,
+    like: Network | None = None,
 ) -> Looks:
     """What one look at each posture tells.
 
@@ -103,6 +108,7 @@ def looks(
     sight : Sight
         At the same.
     looking : Looking
+        How well is looked.
     share : (n, C, M) array, optional
         How much of its information a sighting keeps, of ``estimation.repeated``.
     like : Network, optional
@@ -115,7 +121,9 @@ def looks(
     """
     sigma = looking.noise.sigma(sight.side_px)
     rows, camera, tag = np.nonzero(sight.seen)
-    cov = sigma[rows, camera, tag][:, None, None, None] ** 2 * np.broadcast_to(np.eye(2), (len(rows), 4, 2, 2))
+    cov = sigma[rows, camera, tag][:, None, None, None] ** 2 * np.broadcast_to(
+        np.eye(2), (len(rows), 4, 2, 2)
+    )
     seen = Observations(camera, tag, np.zeros(len(rows), np.int64), sight.uv[rows, camera, tag], cov)
     network = with_offsets(network, seen, looking.repeated)
     known = {} if like is None else {s.name: s for s in like.statics}

@@ -90,6 +90,10 @@ class Plan:
     place: Place | None
     place_station: tuple[float, float] | None
     """Station and offset of the place."""
+    postures_tried: int
+    """On which changes were tried."""
+    shift: Prediction
+    """Over the work."""
 
     @property
     def sigma_h(self) -> float:
@@ -113,11 +117,13 @@ def plan(
     Parameters
     ----------
     setup : Setup
+        The machine on its site.
     arm : Arm
         Of the postures.
     trench : Trench
         Stations in order.
     habits : Habits
+        How it works.
     half_tolerance_m, coverage_factor : float
         Of the job; U = coverage_factor sigma is held against half the tolerance.
     points : int
@@ -162,19 +168,40 @@ def plan(
         gains(setup, few) if search else [],
         place,
         where,
+        len(few),
+        shift,
     )
 
 
 def at_posture(
-    plan: Plan, trench: Trench, shift: Prediction, boom_deg: float, stick_deg: float, bucket_deg: float
-) -> Prediction:
-    """The edge in one posture, directions above the horizontal, at the plan's stand."""
+    plan: Plan,
+    trench: Trench,
+    directions_deg: tuple[float, float, float] | None,
+    reach_depth_m: tuple[float, float],
+) -> EdgePlan:
+    """The edge in one posture at the plan's stand.
+
+    Given are the directions of boom, stick and pin-to-edge above the horizontal; without them the reach of the edge and
+    its depth below the tracks.
+
+    Raises
+    ------
+    PlanningError
+        Out of reach.
+    """
+    net, rate = plan.setup.network, np.deg2rad(plan.habits.bucket_deg_s)
     T_stand, _ = stand_at(trench, plan.stand_station, plan.habits)
-    directions = (np.deg2rad([d]) for d in (boom_deg, stick_deg, bucket_deg))
-    posture = postures_from(
-        plan.setup.network, plan.arm, T_stand[None], *directions, np.deg2rad(plan.habits.bucket_deg_s)
-    )
-    return predict_elsewhere(plan.setup, posture, shift)
+    if directions_deg is not None:
+        boom, stick, bucket = np.deg2rad(directions_deg)[:, None]
+        posture = postures_from(net, plan.arm, T_stand[None], boom, stick, bucket, rate)
+    else:
+        reach, depth = reach_depth_m
+        posture, within = in_the_arms_plane(net, plan.arm, T_stand, [reach], [-depth], plan.habits)
+        if not within[0]:
+            raise PlanningError(
+                f"the arm does not reach {reach:g} m forward and {depth:g} m down; name a nearer place"
+            )
+    return predict_elsewhere(plan.setup, posture, plan.shift).edge
 
 
 def _line(shift: Prediction, station, trench: Trench, most_m: float) -> Line:
@@ -184,7 +211,7 @@ def _line(shift: Prediction, station, trench: Trench, most_m: float) -> Line:
         if here.sum() * 2 >= PASSES:  # a sweep that is mostly unseen tells nothing of the floor
             out[:, k] = [np.median(shift.edge.sigma_h(part)[here]) for part in ("total", "own", "common")]
     with np.errstate(invalid="ignore"):
-        return Line(trench.station, *out, out[0] <= most_m)
+        return Line(trench.station, out[0], out[1], out[2], out[0] <= most_m)
 
 
 def _seen(shift: Prediction) -> list[Seen]:

@@ -149,6 +149,7 @@ def reach_for(arm: Arm, pin_xz):
     Parameters
     ----------
     arm : Arm
+        Its lengths.
     pin_xz : (n, 2) array
         In the cab, metres.
 
@@ -236,7 +237,9 @@ def postures_at(
     network : Network
         Of a machine that ``chain_of`` knows.
     arm : Arm
+        Its lengths.
     T_world_cab : (n, 4, 4) array
+        Where the machine stands.
     edge_xz : (n, 2) array
         Forward and above the cab's origin, metres.
     bucket_rad : (n,) array

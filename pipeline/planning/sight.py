@@ -78,9 +78,11 @@ def sight(network: Network, T_world, rules: SightRules, arm: Arm | None = None, 
     Parameters
     ----------
     network : Network
+        Of cameras and tags.
     T_world : dict of str to (n, 4, 4) array
         Of ``world_poses``.
     rules : SightRules
+        What counts as seen.
     arm : Arm, optional
         Hides what lies behind boom and stick; without it nothing is hidden.
     arm_bodies : two of str

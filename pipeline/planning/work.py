@@ -100,6 +100,4 @@ def around(network: Network, arm: Arm, T_world_cab, forward_m, left_m, height_m:
 
 
 def _at(network: Network, arm: Arm, T, edge, habits: Habits) -> tuple[Postures, np.ndarray]:
-    return postures_at(
-        network, arm, T, edge, np.deg2rad(habits.bucket_deg), np.deg2rad(habits.bucket_deg_s)
-    )
+    return postures_at(network, arm, T, edge, np.deg2rad(habits.bucket_deg), np.deg2rad(habits.bucket_deg_s))

@@ -92,7 +92,9 @@ def read_run(run: Path, network: Network, site: Site) -> LoggedRun:
     total = np.sqrt(table["cov_h_h"][at["tool"]])
     own = np.sqrt(np.maximum(table["cov_h_h"][at["tool"]] - table["common_h_h"][at["tool"]], 0.0))
     frame_s = float(np.median(np.diff(stamps))) * 1e-9
-    looking = Looking(frame_s, _readings_per_look(run, network, frame_s), _repeated(solution), _noise(run, network))
+    looking = Looking(
+        frame_s, _readings_per_look(run, network, frame_s), _repeated(solution), _noise(run, network)
+    )
     everything = Postures(T, angle, rate)
     return LoggedRun(
         run.name,
