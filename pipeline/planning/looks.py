@@ -62,6 +62,8 @@ class Looks:
     """(n, b, p)."""
     seen: np.ndarray
     """(n,) bool: everything that the tool hangs on is seen."""
+    observations: Observations
+    """The pictures of tags."""
     groups: tuple[tuple[np.ndarray, Jacobians], ...]
     """Rows, and the whitened Jacobians of what was measured there, times the root of how much it counts."""
 
@@ -95,7 +97,7 @@ def looks(
     sight: Sight,
     looking: Looking,
     share=None,
-    like: Network | None = None,
+    like: Looks | None = None,
 ) -> Looks:
     """What one look at each posture tells.
 
@@ -111,8 +113,8 @@ def looks(
         How well is looked.
     share : (n, C, M) array, optional
         How much of its information a sighting keeps, of ``estimation.repeated``.
-    like : Network, optional
-        Whose constant errors of corners have the priors to take: of the looks that this is to be put together with.
+    like : Looks, optional
+        Those that these are to be put together with: frames hang as in them, constant errors have their priors.
 
     Raises
     ------
@@ -125,8 +127,10 @@ def looks(
         np.eye(2), (len(rows), 4, 2, 2)
     )
     seen = Observations(camera, tag, np.zeros(len(rows), np.int64), sight.uv[rows, camera, tag], cov)
+    if like is not None:
+        seen = _joined(like.observations, seen)
     network = with_offsets(network, seen, looking.repeated)
-    known = {} if like is None else {s.name: s for s in like.statics}
+    known = {} if like is None else {s.name: s for s in like.network.statics}
     network = replace(network, statics=tuple(known.get(s.name, s) for s in network.statics))
     silent = {s.name: Readings(np.zeros(1, np.int64), np.zeros(1)) for s in network.sensors}
     tied = tie(network, seen, silent)
@@ -169,8 +173,14 @@ def looks(
         H_xx,
         H_xz,
         np.all(told[:, needed], axis=1),
+        seen,
         tuple(kept),
     )
+
+
+def _joined(a: Observations, b: Observations) -> Observations:
+    names = ("camera", "tag", "time_ns", "uv", "cov")
+    return Observations(*(np.concatenate([getattr(a, n), getattr(b, n)]) for n in names))
 
 
 def _chains(count: int, links: list[set[int]]) -> tuple[tuple[int, ...], ...]:

@@ -56,7 +56,7 @@ def predict_elsewhere(setup: Setup, postures: Postures, shift: Prediction) -> Pr
     prior.
     """
     seen = _sight(setup, postures)
-    found = looks(setup.network, postures, seen, setup.looking, like=shift.found.network)
+    found = looks(setup.network, postures, seen, setup.looking, like=shift.found)
     S = np.eye(found.statics.size)
     place = {s.name: k for k, s in enumerate(found.network.statics)}
     ours, theirs = [], []
