@@ -47,6 +47,8 @@ class EstimationError(PipelineError):
 
 class CalibrationError(PipelineError):
     """A log or a survey cannot tell what it was to calibrate."""
+
+
 class PlanningError(PipelineError):
     """The accuracy of this set-up cannot be planned from what its files say."""
 
