@@ -15,6 +15,7 @@ import click
 from pipeline import __version__
 from pipeline.cli.calibrate import calibrate
 from pipeline.cli.plan import plan
+from pipeline.cli.noise import noise
 from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ def main() -> None:
 
 main.add_command(calibrate)
 main.add_command(plan)
+main.add_command(noise)
 
 
 @main.command()

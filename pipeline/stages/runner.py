@@ -80,8 +80,8 @@ def states(job: Job) -> list[StageState]:
     return found
 
 
-def run_stale(job: Job, watch: Watch) -> list[str]:
-    """Run every stale stage, in order; the names of those that ran.
+def run_stale(job: Job, watch: Watch, last: str = "") -> list[str]:
+    """Run every stale stage, in order, up to the one named `last` if any; the names of those that ran.
 
     The run folder must be locked by the caller. Raises PipelineError.
     """
@@ -98,6 +98,8 @@ def run_stale(job: Job, watch: Watch) -> list[str]:
                 f"{job.folder.path}: the manifest of {stage.name} vanished while it was written"
             )
         watch.done(stage, manifest, ran=why is not None)
+        if stage.name == last:
+            break
     return ran
 
 
