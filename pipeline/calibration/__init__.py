@@ -1,1 +1,1 @@
-"""Calibration: what a machine file holds, told from logs made for it."""
+"""What a machine file needs, told from logs made for it: lenses, camera clusters, mounts, axes, benchmarks, drift."""

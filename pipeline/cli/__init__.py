@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pipeline import __version__
+from pipeline.cli import calibrate_network  # noqa: F401  its commands join `calibrate`
 from pipeline.cli.calibrate import calibrate
 from pipeline.cli.plan import plan
 from pipeline.cli.noise import noise

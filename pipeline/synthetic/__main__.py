@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from pipeline.errors import PipelineError
-from pipeline.synthetic import command
+from pipeline.synthetic import calibration_sites, command
 from pipeline.synthetic.calibration_logs import LOGS
 
 DRAWN_LOGS = 5
@@ -23,7 +23,11 @@ def main(arguments: list[str] | None = None) -> None:
         description="Render logs of a site whose truth is known. Without options: the committed sample and the "
         f"{DRAWN_LOGS} drawn 1280x960 logs of {DRAWN_MINUTES:g} minutes that the benchmarks use.",
     )
-    parser.add_argument("--site", choices=(*command.SITES, *LOGS), help="which site; one log of it is made")
+    parser.add_argument(
+        "--site",
+        choices=(*command.SITES, *LOGS, *calibration_sites.NAMES),
+        help="which site; one log of it is made",
+    )
     parser.add_argument("--size", choices=tuple(command.SIZES), help="640 (640x480) or 1280 (1280x960)")
     parser.add_argument("--minutes", type=float, help="at least this long, in whole cycles")
     parser.add_argument(
@@ -39,12 +43,13 @@ def main(arguments: list[str] | None = None) -> None:
     if wanted.sample:
         _make(wanted.jobs, folder=wanted.folder)
     elif any(value is not None for value in one):
+        small = wanted.site in calibration_sites.NAMES or (wanted.minutes is None and wanted.seed is None)
         _make(
             wanted.jobs,
             folder=wanted.folder,
             site=wanted.site or "trench",
             minutes=wanted.minutes,
-            size=wanted.size or ("640" if wanted.minutes is None and wanted.seed is None else "1280"),
+            size=wanted.size or ("640" if small else "1280"),
             seed=command.SAMPLE_SEED if wanted.seed is None else wanted.seed,
         )
     else:
