@@ -16,7 +16,7 @@ from pipeline.errors import CalibrationError
 from pipeline.estimation import diagnostics
 from pipeline.estimation.adjust import problem_of_log
 from pipeline.estimation.marginals import Marginals, marginals
-from pipeline.estimation.observability import findings
+from pipeline.estimation.observability import Finding, findings
 from pipeline.estimation.optimise import Optimum, optimise
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.repeated import Repeated, with_offsets
@@ -39,6 +39,8 @@ class Adjusted:
     sigma0: float
     """Root of the variance component: 1 where corners scatter as detection says."""
     warnings: tuple[str, ...]
+    untold: tuple[Finding, ...]
+    """What the log cannot tell or part, all of it; the warnings hold what matters whatever is calibrated."""
 
     @property
     def network(self) -> Network:
@@ -128,18 +130,18 @@ def adjusted(
     at = problem, optimum.values, optimum.weights, found
     corners = diagnostics.fit_corners(*at)
     variance = diagnostics.variance_component(corners + diagnostics.fit_sensors(*at), settings.huber)
-    sentences = [f.sentence for f in findings(problem)]
+    untold = findings(problem)
+    sentences = [w for w in tied.warnings if "never seen" not in w]  # of a yard's markers some always are
+    sentences += [f.sentence for f in untold if f.kind in ("gauge", "line")]
+    sentences += diagnostics.stiff_motion(diagnostics.motion_fit(problem, optimum.values))
     return Adjusted(
         problem,
         optimum,
         found,
         diagnostics.corner_table(problem, corners),
         float(variance["sigma0_squared"] or np.nan) ** 0.5,
-        (
-            *tied.warnings,
-            *sentences,
-            *diagnostics.stiff_motion(diagnostics.motion_fit(problem, optimum.values)),
-        ),
+        tuple(sentences),
+        untold,
     )
 
 

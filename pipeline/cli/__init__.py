@@ -17,6 +17,7 @@ from pipeline.cli import calibrate_network  # noqa: F401  its commands join `cal
 from pipeline.cli.calibrate import calibrate
 from pipeline.cli.plan import plan
 from pipeline.cli.noise import noise
+from pipeline.cli.survey import survey
 from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def main() -> None:
 main.add_command(calibrate)
 main.add_command(plan)
 main.add_command(noise)
+main.add_command(survey)
 
 
 @main.command()

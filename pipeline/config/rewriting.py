@@ -19,6 +19,9 @@ from pipeline.errors import ConfigError
 DIGITS = 10
 """Significant digits of what is written: a covariance that is rounded to fewer need not be one any more."""
 
+DECIMALS = 6
+"""A northing of seven digits is still written to a thousandth of a millimetre."""
+
 
 def with_values(text: str, source: str, values: Mapping[str, Any]) -> str:
     """The text of a TOML file with some values set.
@@ -95,4 +98,6 @@ def _plain(value: Any) -> Any:
         return value
     if isinstance(value, Sequence):
         return [_plain(item) for item in value]
-    return float(f"{float(value):.{DIGITS}g}")
+    value = float(value)
+    whole = len(str(int(abs(value)))) if np.isfinite(value) else 0
+    return float(f"{value:.{max(DIGITS, whole + DECIMALS)}g}")

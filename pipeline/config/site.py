@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from pipeline.config.quantities import (
+    Calibrated,
     Identifier,
     Name,
     NonNegative,
@@ -18,6 +19,7 @@ from pipeline.config.quantities import (
     Section,
     SigmaTriple,
     Triple,
+    check_covariance,
 )
 from pipeline.config.utility import MAX_UTILITIES, Utility
 
@@ -69,10 +71,23 @@ class SurveyedPose(Section):
     """Easting, northing, elevation of the marker's centre, grid unit."""
     rpy_deg: Triple
     """``R_grid_marker = Rz(yaw) @ Ry(pitch) @ Rx(roll)``, degrees."""
-    sigma_mm: SigmaTriple | NonNegative
+    sigma_mm: SigmaTriple | NonNegative | None = None
     """Of the centre, along the marker's axes."""
-    sigma_deg: SigmaTriple | NonNegative
+    sigma_deg: SigmaTriple | NonNegative | None = None
     """Of the rotation, about the marker's axes."""
+    covariance: tuple[tuple[float, ...], ...] | None = None
+    """6x6 covariance of ``xi = [rho, phi]`` in m and rad instead of the two sigmas."""
+    calibrated: Calibrated | None = None
+
+    @model_validator(mode="after")
+    def _one_uncertainty(self) -> SurveyedPose:
+        if (self.sigma_mm is not None and self.sigma_deg is not None) == (self.covariance is not None):
+            raise ValueError(
+                "give either sigma_mm and sigma_deg, or covariance (6x6); a surveyed pose is not exact by default"
+            )
+        if self.covariance is not None:
+            check_covariance(self.covariance, 6)
+        return self
 
 
 class SurveyedCorner(Section):
@@ -409,4 +424,10 @@ class Site(Section):
         if pose is None:
             return None
         x, y, z = self.grid.to_world(np.array(pose.enh)).tolist()
-        return Pose(xyz_m=(x, y, z), rpy_deg=pose.rpy_deg, sigma_mm=pose.sigma_mm, sigma_deg=pose.sigma_deg)
+        return Pose(
+            xyz_m=(x, y, z),
+            rpy_deg=pose.rpy_deg,
+            sigma_mm=pose.sigma_mm,
+            sigma_deg=pose.sigma_deg,
+            covariance=pose.covariance,
+        )

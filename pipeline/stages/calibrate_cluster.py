@@ -102,7 +102,7 @@ def values_of(cluster: Cluster, found: CalibrationLog, free_intrinsics: bool) ->
                 "height": camera.intrinsics.height,
                 **dict(zip(("fx", "fy", "cx", "cy"), lens[:4].tolist(), strict=True)),
                 "distortion": lens[4:],
-                "covariance": 0.5 * (covariance + covariance.T),
+                "covariance": written_covariance(covariance),
                 "calibrated": stamp,
             }
     return values
@@ -114,5 +114,12 @@ def pose_table(T: np.ndarray, covariance: np.ndarray | None, stamp: Mapping[str,
     if covariance is None:
         table |= {"sigma_mm": 0.0, "sigma_deg": 0.0}
     else:
-        table["covariance"] = 0.5 * (covariance + covariance.T)
+        table["covariance"] = written_covariance(covariance)
     return {**table, "calibrated": dict(stamp)}
+
+
+def written_covariance(covariance: np.ndarray) -> np.ndarray:
+    """A covariance as it goes into a file: symmetric, without what is only rounding."""
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    even = 0.5 * (covariance + covariance.T)
+    return np.where(np.abs(even) > 1e-9 * np.outer(sigma, sigma), even, 0.0)
