@@ -106,7 +106,7 @@ def solved(network, posture, seen, sigma: float, rng: np.random.Generator) -> np
     """Error of the edge's place in the world after one simulated look, (3,) m."""
     truth = [true_static(rng, s) for s in network.statics]
     by_name = {s.name: value for s, value in zip(network.statics, truth, strict=True)}
-    T_world = {k: T for k, T in posture.T_world.items()}
+    T_world = dict(posture.T_world.items())
     T_world["bucket"] = T_world["stick"] @ by_name["joint bucket axis"] @ rotz(posture.angle["bucket"])
     rows = []
     for c, t in np.argwhere(seen.seen[0]):
@@ -206,8 +206,9 @@ def main() -> int:
         said = f"sample's report {1e3 * beside[1]:.2f} mm, predicted {1e3 * beside[0]:.2f} mm ({100 * off:+.1f} %)"
     line = (
         f"planning: scatter over prediction {min(ratios):.3f} to {max(ratios):.3f} in {len(rows)} configurations of "
-        f"{options.draws} draws (bar {RATIO[0]} to {RATIO[1]}); map of {options.points} x {options.points} with {postures} "
-        f"postures in reach {seconds:.1f} s (bar {MAP_S:g}); {said} (bar 15 %)" + ("" if met else "; MISSED")
+        f"{options.draws} draws (bar {RATIO[0]} to {RATIO[1]}); map of {options.points} x {options.points} with "
+        f"{postures} postures in reach {seconds:.1f} s (bar {MAP_S:g}); {said} (bar 15 %)"
+        + ("" if met else "; MISSED")
     )
     extra = {"map_s": seconds, "map_points": options.points, "map_postures": postures}
     if beside is not None:

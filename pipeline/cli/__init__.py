@@ -15,8 +15,8 @@ import click
 from pipeline import __version__
 from pipeline.cli import calibrate_network  # noqa: F401  its commands join `calibrate`
 from pipeline.cli.calibrate import calibrate
-from pipeline.cli.plan import plan
 from pipeline.cli.noise import noise
+from pipeline.cli.plan import plan
 from pipeline.cli.survey import survey
 from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
 

@@ -38,8 +38,8 @@ def run(
             if change.sigmas is not None and change.sigmas > MOVED_SIGMAS:
                 edge = "" if change.edge_mm is None else f", {change.edge_mm:.1f} mm at the cutting edge"
                 sentences.append(
-                    f"{key} moved by {change.sigmas:.1f} sigma{edge} until {_day(change.date)}: it was knocked, or one of "
-                    "the two calibrations is wrong; calibrate it again before the next job"
+                    f"{key} moved by {change.sigmas:.1f} sigma{edge} until {_day(change.date)}: it was knocked, or one "
+                    "of the two calibrations is wrong; calibrate it again before the next job"
                 )
         last = changes[-1]
         if last.age_days is not None and last.age_days > old_days:

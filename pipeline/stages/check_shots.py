@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.site import Checks
+from pipeline.config.checks import Checks
 from pipeline.estimation.sensitivities import Sensitivities
 from pipeline.estimation.table import sensitivities_from_columns
 from pipeline.stages.job import Job

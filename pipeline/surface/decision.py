@@ -13,8 +13,8 @@ import numpy as np
 
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
+from pipeline.surface.one_sweep import sigma_of_sum
 from pipeline.surface.sides import SIDES, Sides
-from pipeline.surface.sweep import sigma_of_sum
 
 PASS, FAIL, CANNOT_TELL, NOT_REACHED = "PASS", "FAIL", "CANNOT TELL", "NOT REACHED"
 CUT, PARTLY, UNREACHED = "cut", "partly cut", "not reached"

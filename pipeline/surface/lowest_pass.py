@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from pipeline.surface.sweep import sweeps_of
+from pipeline.surface.one_sweep import sweeps_of
 
 _WINDOW = 6.0
 """Passes more than this many sigmas above the lowest estimate are left out: they cannot have been the floor."""

@@ -29,7 +29,8 @@ from numba import njit
 
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
-from pipeline.surface.sweep import EdgePath, SweepSettings, sweeps_of
+from pipeline.surface.one_sweep import sweeps_of
+from pipeline.surface.sweep import EdgePath, SweepSettings
 
 SIDES = ("left", "right")
 LOW_M = 0.10

@@ -27,8 +27,8 @@ import numpy as np
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.design import Design
 from pipeline.surface.ground import Ground
+from pipeline.surface.one_sweep import sigma_of_sum, sweeps_of
 from pipeline.surface.sides import LOW_M, SideRows
-from pipeline.surface.sweep import sigma_of_sum, sweeps_of
 
 CUT, LEFT, OVER = "cut", "left to cut", "over-dug"
 KINDS = (CUT, LEFT, OVER)

@@ -1,4 +1,4 @@
-"""Recording what `calibration_sites` describes: the log, machine.toml and site.toml, surveyed corners, and the truth."""
+"""Recording what `calibration_sites` describes: log, machine.toml and site.toml, surveyed corners, and truth."""
 
 from __future__ import annotations
 
