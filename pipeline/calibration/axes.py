@@ -1,7 +1,7 @@
 """The axis of a joint from the motion of what turns about it: circles in planes.
 
-A marker on the child, seen from a marker on the parent, moves on circles about one line: its turns have one direction in
-common, and every point of it keeps its distance from the line and its plane across it. That is what
+A marker on the child, seen from a marker on the parent, moves on circles about one line: its turns have one direction
+in common, and every point of it keeps its distance from the line and its plane across it. That is what
 
     T_parent_marker(i) = T_parent_axis Rz(angle_i) T_axis_marker
 

@@ -28,7 +28,7 @@ class Closures:
     time_ns: np.ndarray
     """(n,) of the first camera's picture."""
     xi: np.ndarray
-    """(n, 6) ``T_first_second`` of two pictures alone against the adjusted one, felt in the second camera, m and rad."""
+    """(n, 6) ``T_first_second`` of two pictures alone against the adjusted one, felt in the second, m and rad."""
 
     @property
     def rms_m(self) -> float:

@@ -18,6 +18,7 @@ from pipeline.config import Machine, Site
 from pipeline.config.machine import CuttingEdge, JointBody, MovingBody
 from pipeline.config.quantities import Pose
 from pipeline.errors import CalibrationError
+from pipeline.estimation.repeated import Repeated
 from pipeline.estimation.validation import left_out
 from pipeline.geometry import se3
 from pipeline.network import network_of
@@ -195,8 +196,8 @@ def _refuse_unshared(network: Network, shared: np.ndarray, reference: int) -> No
         if k not in reached:
             raise CalibrationError(
                 f"camera '{name}' shares only {max(shared[k, j] for j in reached)} instants with the cameras that are "
-                f"tied to '{names[reference]}' (at least {LEAST_SHARED}): too few views; record longer, with markers of "
-                "the site before both"
+                f"tied to '{names[reference]}' (at least {LEAST_SHARED}): too few views; record longer, with markers "
+                "of the site before both"
             )
 
 
@@ -223,7 +224,7 @@ def calibrate_cluster(
     Raises
     ------
     CalibrationError
-        Two few views, a camera apart from the others, or pictures that contradict the files.
+        Too few views, a camera apart from the others, or pictures that contradict the files.
     """
     from pipeline.estimation.table import observations_of
 
@@ -234,17 +235,22 @@ def calibrate_cluster(
 
 
 def cluster_of(
-    network: Network, observations: Observations, site: Site, reference: str, alone: bool = True
+    network: Network,
+    observations: Observations,
+    site: Site,
+    reference: str,
+    alone: bool = True,
+    repeated: Repeated | None = None,
 ) -> Cluster:
-    """As `calibrate_cluster`, from the network of `cluster_machine` and what was seen."""
+    """As `calibrate_cluster`, from the network of `cluster_machine` and what was seen; `repeated` as for `adjusted`."""
     shared = shared_instants(network, observations)
     _refuse_unshared(network, shared, network.camera_index(reference))
-    whole = adjusted(network, observations, settings=site.estimation)
+    whole = adjusted(network, observations, settings=site.estimation, repeated=repeated)
     benchmarks = left_out(whole.problem, whole.optimum.values, whole.found)
     if whole.sigma0 > WRONG_SIGMA0:
         raise CalibrationError(_contradiction(whole))
     odd, even = (
-        adjusted(network, _every_second(observations, half), settings=site.estimation) for half in (0, 1)
+        adjusted(network, _every_second(observations, half), settings=site.estimation, repeated=repeated) for half in (0, 1)
     )
     names = [camera.name for camera in network.cameras]
     told = [name for name in names if name != reference]

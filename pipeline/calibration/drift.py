@@ -1,4 +1,4 @@
-"""How calibrated quantities moved from one dated machine file to the next: in sigmas, and in millimetres at the edge."""
+"""How calibrated quantities moved from one dated machine file to the next: in sigmas, and millimetres at the edge."""
 
 from __future__ import annotations
 

@@ -46,6 +46,8 @@ def cluster_sheet(
         Whether the lenses are written too.
     subject, origin
         As `Sheet` has them.
+    language : str
+        Of the words.
     """
     words = Words(language)
     tied = [pair for pair in cluster.pairs if cluster.reference in (pair.first, pair.second)]

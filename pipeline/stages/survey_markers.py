@@ -7,6 +7,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -79,7 +80,7 @@ def run(
         subject=model.site.id,
         origin={file.name: f"sha256 {stamp['sha256'][:12]}", "surveyed": day.isoformat()},
     )
-    values: dict[str, object] = {}
+    values: dict[str, Any] = {}
     for pose in poses:
         values[f"benchmarks.{pose.name}.corners"] = None
         values[f"benchmarks.{pose.name}.sigma_corner_mm"] = None
@@ -114,8 +115,8 @@ def surveyed_markers(
         if read is None:
             if str(point) in layout:
                 raise CalibrationError(
-                    f"{source}: '{named}', as point {point} is said to be, is no corner of a marker of site.toml; "
-                    f"write such as {_example(site)}"
+                    f"{source}: '{named}', as point {point} is said to be, is no corner of a marker of site.toml; write "
+                    f"such as {_example(site)}"
                 )
             unread.append(str(point))
             continue

@@ -1,0 +1,72 @@
+"""Machine files by date: what moved is told in sigmas and millimetres."""
+
+import datetime
+
+import numpy as np
+import pytest
+
+from pipeline.calibration.drift import history
+from pipeline.config import load_machine
+from pipeline.config.rewriting import with_values
+from pipeline.errors import CalibrationError
+from pipeline.resources import template_folder
+from pipeline.stages import calibrate_history
+
+SAMPLE = template_folder().parent / "sample_logs" / "trench" / "machine.toml"
+TODAY = datetime.date(2026, 6, 1)
+
+
+def mount(x_m, yaw_deg, day, sigma_mm=1.0, sigma_deg=0.01):
+    return {
+        "xyz_m": [x_m, 0.5, 2.0],
+        "rpy_deg": [0.0, 0.0, yaw_deg],
+        "sigma_mm": sigma_mm,
+        "sigma_deg": sigma_deg,
+        "calibrated": {"date": datetime.date.fromisoformat(day), "by": "calibrate cluster"},
+    }
+
+
+def texts():
+    text = SAMPLE.read_text(encoding="utf-8")
+    return [
+        with_values(text, "machine.toml", {"cameras.arm.mount": value})
+        for value in (mount(1.0, 0.0, "2025-06-01"), mount(1.003, 0.0, "2025-12-01"), mount(1.003, 0.2, "2026-05-01"))
+    ]
+
+
+def test_changes_in_closed_form():
+    machines = [load_machine(text, "machine.toml") for text in texts()]
+    first, moved, turned = history(machines, TODAY, 8.0)["cameras.arm.mount"]
+    assert first.sigmas is None and first.age_days == 365
+    # 3 mm against two calibrations of 1 mm, over six components.
+    assert moved.sigmas == pytest.approx(3 / np.sqrt(2) / np.sqrt(6))
+    assert moved.edge_mm == pytest.approx(3.0)
+    assert turned.sigmas == pytest.approx(0.2 / 0.01 / np.sqrt(2) / np.sqrt(6))
+    assert turned.edge_mm == pytest.approx(8000 * np.deg2rad(0.2))
+    assert turned.age_days == 31
+
+
+def test_a_quantity_that_is_as_before_adds_no_row():
+    machines = [load_machine(text, "machine.toml") for text in texts()]
+    assert len(history(machines, TODAY, 8.0)["cameras.bench.mount"]) == 1
+
+
+def test_the_stage_orders_files_and_names_what_moved_and_what_is_old(tmp_path):
+    names = ("machine.before-2025-11-30-1.toml", "machine.before-2025-11-30-2.toml", "machine.toml")
+    for name, text in zip(names, texts(), strict=True):
+        (tmp_path / name).write_text(text, encoding="utf-8")
+    rows, sentences = calibrate_history.run([tmp_path / n for n in reversed(names)], TODAY, 8.0, 30)
+    mine = [row for row in rows if row[0] == "cameras.arm.mount"]
+    assert [row[1] for row in mine] == ["2025-06-01", "2025-12-01", "2026-05-01"]
+    assert mine[2][3:] == ("5.8", "27.9", "31")
+    assert any("cameras.arm.mount moved by 5.8 sigma, 27.9 mm at the cutting edge" in s for s in sentences)
+    assert any("cameras.arm.mount was calibrated 31 days ago (limit 30)" in s for s in sentences)
+
+
+def test_files_of_two_machines_are_refused(tmp_path):
+    a, b = tmp_path / "a.toml", tmp_path / "b.toml"
+    text = SAMPLE.read_text(encoding="utf-8")
+    a.write_text(text, encoding="utf-8")
+    b.write_text(text.replace('id = "ex-14"', 'id = "ex-15"'), encoding="utf-8")
+    with pytest.raises(CalibrationError, match="different machines: ex-14, ex-15"):
+        calibrate_history.run([a, b], TODAY, 8.0)
