@@ -49,15 +49,16 @@ def agreed(
             "and check the point's coordinates and the clock of the file"
         )
     try:
+        robust = bucket.robust(rig, stands, touches, list(points.values()))
+        worst = suspects(robust, len(points))
+        if worst and worst[0].wrong:
+            raise CalibrationError(_named(robust, points, worst[0]))
         adjusted = bucket.adjust(rig, stands, touches, list(points.values()))
-        worst = suspects(adjusted, len(points))
     except (FloatingPointError, np.linalg.LinAlgError):
         raise CalibrationError(
             "no curve brings the cutting edge to the points that were touched: check their coordinates, the linkage's "
             "lengths and its branch in machine.toml"
         ) from None
-    if worst and worst[0].wrong:
-        raise CalibrationError(_named(adjusted, points, worst[0]))
     angle = curve_fit.direction(adjusted, np.array([s.raw for s in stands])).angle_rad
     turn = float(np.rad2deg(np.ptp(np.unwrap(np.sort(angle)))))
     if turn < LEAST_TURN_DEG and not wear:

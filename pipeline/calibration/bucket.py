@@ -48,7 +48,7 @@ STEP_SIGMAS = 1e-6
 
 
 def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: Sequence[float]) -> Adjusted:
-    """Curve, tool and pin from touches: robust first, so that what is wrong is seen where it is, then by least squares.
+    """Curve, tool and pin from touches, by least squares that begin where the robust ones ended.
 
     Parameters
     ----------
@@ -64,15 +64,23 @@ def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: 
     Returns
     -------
     Adjusted
-        Of the last step, which no robust weight touched.
+        No robust weight is left in it.
 
     Raises
     ------
     FloatingPointError
         No curve brings the edge near the points within the reach of the bars.
     """
-    raw = np.array([stand.raw for stand in stands])
-    middle, half = 0.5 * (raw.min() + raw.max()), max(0.5 * float(np.ptp(raw)), 1e-12)
+    return _iterate(robust(rig, stands, touches, points), _scale(rig, stands, points), huber=False)
+
+
+def robust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: Sequence[float]) -> Adjusted:
+    """The same by robust least squares: a touch that is wrong by metres stays wrong alone.
+
+    The residuals are those of one least-squares step from there, linearised, so that they can be tested (`snooping`)
+    as if no weight had been touched.
+    """
+    middle, half = _stroke(stands)
     shared = stands[0].factors.shape[1]
     mean, scale = _prior(rig, middle, half, shared, points)
     empty = np.zeros((0, 0))
@@ -82,8 +90,17 @@ def adjust(rig: Rig, stands: Sequence[Stand], touches: Sequence[Touch], points: 
     )  # fmt: skip
     if rig.curve is None:
         found = replace(found, value=_start(found))
-    robust = _iterate(found, scale, huber=True)
-    return _iterate(robust, scale, huber=False)
+    return _iterate(found, scale, huber=True)
+
+
+def _stroke(stands: Sequence[Stand]) -> tuple[float, float]:
+    """Middle and half of the readings."""
+    raw = np.array([stand.raw for stand in stands])
+    return 0.5 * float(raw.min() + raw.max()), max(0.5 * float(np.ptp(raw)), 1e-12)
+
+
+def _scale(rig: Rig, stands: Sequence[Stand], points: Sequence[float]) -> np.ndarray:
+    return _prior(rig, *_stroke(stands), stands[0].factors.shape[1], points)[1]
 
 
 def _prior(
@@ -174,7 +191,7 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
     z = np.linalg.lstsq(scale, value - found.mean, rcond=None)[0]
     weight = np.ones(len(found.touches))
     for _ in range(ITERATIONS):
-        residual, J, noise = _linearised(found, value)
+        residual, J, noise = linearised(found, value)
         if not np.all(np.isfinite(J)):
             raise FloatingPointError("the bars cannot reach the touches")
         block = np.repeat(1.0 / np.sqrt(weight), 3)
@@ -190,7 +207,7 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
         size = float(np.sqrt(step @ normal @ step))
         if huber:
             before = weight
-            residual = _linearised(found, value)[0].reshape(-1, 3)
+            residual = linearised(found, value)[0].reshape(-1, 3)
             own = np.array([noise[3 * i : 3 * i + 3, 3 * i : 3 * i + 3] for i in range(len(residual))])
             normalised = np.sqrt(np.einsum("ni,nij,nj->n", residual, np.linalg.inv(own), residual) / 3)
             weight = np.minimum(1.0, HUBER / np.maximum(normalised, 1e-12))
@@ -198,10 +215,12 @@ def _iterate(found: Adjusted, scale: np.ndarray, huber: bool) -> Adjusted:
                 break
         elif size < STEP_SIGMAS:
             break
-    residual, J, noise = _linearised(found, value)
+    residual, J, noise = linearised(found, value)
     A = J @ scale
     normal = A.T @ np.linalg.solve(noise, A) + np.eye(scale.shape[1])
     covariance = scale @ np.linalg.solve(normal, scale.T)
+    if huber:
+        residual = residual - A @ np.linalg.solve(normal, A.T @ np.linalg.solve(noise, residual) - z)
     flat = np.any(scale[found.curve] != 0, axis=0) & (found.rig.curve is None)
     return replace(
         found,
@@ -219,7 +238,7 @@ def _reaches(found: Adjusted, value: np.ndarray) -> bool:
     return bool(np.all(np.isfinite(moved.angle(np.array([s.raw for s in found.stands]))[0])))
 
 
-def _linearised(found: Adjusted, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def linearised(found: Adjusted, value: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(3n,) given minus adjusted, (3n, p) Jacobian of the adjusted, (3n, 3n) covariance of the rest."""
     rig = found.rig
     at = replace(found, value=value)
@@ -258,9 +277,11 @@ def _linearised(found: Adjusted, value: np.ndarray) -> tuple[np.ndarray, np.ndar
         J[rows] = np.outer(d_angle, J_angle[k])
         J[rows, AXIS] += R_axis @ np.hstack([np.eye(3), -so3.hat(p_axis)]) @ Jr_axis
         J[rows, TOOL] += T_world_tool[:3, :3] @ np.hstack([np.eye(3), -so3.hat(p_tool)]) @ Jr_tool
+        # The shared error turns about the pin whatever moved the edge before.
+        shared = stand.factors @ value[first_factor:first_point]
+        J[rows] += so3.hat(shared[3:]) @ J[rows]
         J[rows, first_factor:first_point] = G @ stand.factors
-        shared = value[first_factor:first_point]
-        p_given = p_world + G @ stand.factors @ shared
+        p_given = p_world + G @ shared
         if touch.point >= 0:
             d = slice(first_point + 3 * touch.point, first_point + 3 * touch.point + 3)
             J[rows, d] = -np.eye(3)
@@ -285,11 +306,11 @@ def without(found: Adjusted, touch: int, points: Sequence[float]) -> Adjusted:
     touches = [t for i, t in enumerate(found.touches) if i != touch]
     used = sorted({t.stand for t in touches})
     stands = [found.stands[k] for k in used]
-    return adjust(found.rig, stands, [replace(t, stand=used.index(t.stand)) for t in touches], points)
+    return robust(found.rig, stands, [replace(t, stand=used.index(t.stand)) for t in touches], points)
 
 
 def predicted(found: Adjusted, stand: Stand, touch: Touch) -> np.ndarray:
     """(3,) where an adjustment puts a touch that it need not hold: what its coordinates should have been."""
     asked = replace(touch, stand=0)
     moved = replace(found, stands=(stand,), touches=(asked,))
-    return touch.p_world - _linearised(moved, found.value)[0]
+    return touch.p_world - linearised(moved, found.value)[0]

@@ -54,7 +54,7 @@ def suspects(found: Adjusted, points: int) -> list[Suspect]:
     Parameters
     ----------
     found : Adjusted
-        By least squares, no robust weights.
+        By `bucket.robust`, or by least squares.
     points : int
         Number of known points.
     """

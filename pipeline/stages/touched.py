@@ -31,6 +31,8 @@ STILL_READINGS = 5.0
 """A reading further than so many sigmas from the mean so far ends a stand."""
 ENDS_S = 0.1
 """At either end of a stand are left out: it is still settling, or about to go."""
+AS_WELL = 2.0
+"""Epochs of a stand are averaged whose own variance is at most so many times the least."""
 RULE = RestRule(still_s=STILL_S)
 
 
@@ -161,6 +163,10 @@ def _stand(
     raw: np.ndarray,
     noise: float,
 ) -> Stand:
+    # Between two pictures of the stick its pose rests on the motion prior, which knows of no standing still: an epoch
+    # like that has three times the sigma and says nothing that its neighbours do not.
+    position = np.trace(gaussian.from_upper_triangle(tool.own[epochs])[:, :3, :3], axis1=1, axis2=2)
+    epochs = epochs[position <= AS_WELL * position.min()]
     T = se3.from_rotation_translation(
         so3.from_quaternion(tool.q_world_body[epochs]), tool.p_world[epochs].astype(float)
     )
