@@ -17,7 +17,7 @@ export UV_SYSTEM_CERTS ?= true
 MAKEFLAGS += --silent --no-print-directory
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help report pdf log-is-named setup test test-all check format schemas sample-logs bench clean lock
+.PHONY: help report pdf log-is-named setup test test-all check format schemas sample-logs bench paper clean lock
 
 help: ## What can be made
 	echo "gradetrace: from the log of an excavator's cameras to a trench report"
@@ -90,6 +90,9 @@ bench: .venv/dev.stamp ## Run every benchmark and hold it against its bars
 
 bench-%: .venv/dev.stamp ## Run one benchmark, for example: make bench-main-job
 	$(BIN)/python -m benchmarks.$(subst -,_,$*) $(ARGS)
+
+paper: .venv/dev.stamp ## Lay the figures and claims of the paper beside ours, on runs/paper/paper.html
+	$(BIN)/python -m benchmarks.paper $(ARGS)
 
 setup: .venv/dev.stamp ## Make the environment and do nothing more
 

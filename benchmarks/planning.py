@@ -74,10 +74,13 @@ class Row:
 def scaled(document, factor: float):
     """The same file with every sigma of a static multiplied."""
     if isinstance(document, dict):
-        return {
-            key: ([factor * x for x in v] if isinstance(v, list) else factor * v) if key.startswith("sigma") else scaled(v, factor)
-            for key, v in document.items()
-        }  # fmt: skip
+        out = {}
+        for key, value in document.items():
+            if not key.startswith("sigma"):
+                out[key] = scaled(value, factor)
+            else:
+                out[key] = [factor * x for x in value] if isinstance(value, list) else factor * value
+        return out
     return [scaled(v, factor) for v in document] if isinstance(document, list) else document
 
 
@@ -106,7 +109,7 @@ def solved(network, posture, seen, sigma: float, rng: np.random.Generator) -> np
     """Error of the edge's place in the world after one simulated look, (3,) m."""
     truth = [true_static(rng, s) for s in network.statics]
     by_name = {s.name: value for s, value in zip(network.statics, truth, strict=True)}
-    T_world = dict(posture.T_world.items())
+    T_world = dict(posture.T_world)
     T_world["bucket"] = T_world["stick"] @ by_name["joint bucket axis"] @ rotz(posture.angle["bucket"])
     rows = []
     for c, t in np.argwhere(seen.seen[0]):
