@@ -163,7 +163,9 @@ def main() -> int:
         figures = ", ".join(f"{k} {v:.3f}" for k, v in row.items() if isinstance(v, float))
         print(f"{row['quantity']}: {figures}{'' if row['good'] else '  MISSED'}")
     missed = [row["quantity"] for row in rows if not row["good"]]
-    line = f"clusters: {draws} drawn rigs; " + ("all at their bars" if not missed else f"missed: {', '.join(missed)}")
+    line = f"clusters: {draws} drawn rigs; " + (
+        "all at their bars" if not missed else f"missed: {', '.join(missed)}"
+    )
     keep_result("calibration_cluster", rows, line)
     print(line)
     return int(bool(missed))

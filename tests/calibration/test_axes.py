@@ -25,7 +25,9 @@ AXIS, MARKER = pose([0.4, -0.3, 0.8], [0.3, 0.2, 0.1]), pose([1.0, -0.5, 0.3], [
 def poses(angles, rng=None):
     T = np.array([AXIS @ pose([0, 0, a], [0, 0, 0]) @ MARKER for a in angles])
     if rng is not None:
-        T = np.array([t @ pose(e[3:], e[:3]) for t, e in zip(T, rng.normal(size=(len(T), 6)) * SIGMA, strict=True)])
+        T = np.array(
+            [t @ pose(e[3:], e[:3]) for t, e in zip(T, rng.normal(size=(len(T), 6)) * SIGMA, strict=True)]
+        )
     return T
 
 

@@ -93,7 +93,9 @@ def test_errors_and_halves_scatter_as_their_covariances_say():
         machine = load_machine(calibration_log.machine_text(drawn), "machine.toml")
         site = load_site(calibration_log.site_toml(drawn), "site.toml")
         network = network_of(cluster_machine(machine, "bench"), site)
-        found = cluster_of(network, seen(drawn, network, np.random.default_rng(seed)), site, "bench", repeated=WHITE)
+        found = cluster_of(
+            network, seen(drawn, network, np.random.default_rng(seed)), site, "bench", repeated=WHITE
+        )
         e = error_of(drawn, found.pairs[0])
         lengths.append(e @ np.linalg.solve(found.pairs[0].covariance, e))
         xi, expected = found.cross["arm"]

@@ -64,7 +64,10 @@ def test_errors_lie_within_their_sigmas_and_the_fit_is_as_good_as_it_says():
     for _ in range(300):
         found = marker_pose(marker(shot(PRINT, rng=rng)))
         e = np.concatenate(
-            [R.T @ (T - found.T_world_marker[:3, 3]), Rotation.from_matrix(found.T_world_marker[:3, :3].T @ R).as_rotvec()]
+            [
+                R.T @ (T - found.T_world_marker[:3, 3]),
+                Rotation.from_matrix(found.T_world_marker[:3, :3].T @ R).as_rotvec(),
+            ]
         )
         z.append(e / np.sqrt(np.diagonal(found.covariance)))
         fit.append(found.chi_square)
@@ -129,7 +132,9 @@ def test_what_nothing_explains_is_said():
     q[0] += [0.03, 0.02, -0.03]
     q[1] += [-0.03, 0.03, 0.02]
     q[2] += [0.02, -0.03, 0.03]
-    with pytest.raises(CalibrationError, match="no order of the corners and no single one of them explains it"):
+    with pytest.raises(
+        CalibrationError, match="no order of the corners and no single one of them explains it"
+    ):
         marker_pose(marker(q))
 
 

@@ -30,7 +30,11 @@ def texts():
     text = SAMPLE.read_text(encoding="utf-8")
     return [
         with_values(text, "machine.toml", {"cameras.arm.mount": value})
-        for value in (mount(1.0, 0.0, "2025-06-01"), mount(1.003, 0.0, "2025-12-01"), mount(1.003, 0.2, "2026-05-01"))
+        for value in (
+            mount(1.0, 0.0, "2025-06-01"),
+            mount(1.003, 0.0, "2025-12-01"),
+            mount(1.003, 0.2, "2026-05-01"),
+        )
     ]
 
 

@@ -27,7 +27,9 @@ def test_focal_length_is_distance():
     # 0.1 % of the focal length, on the axis: 10 mm of 10 m, and nothing across.
     assert found.along_m[row, column] == pytest.approx(0.010, rel=2e-3)
     assert found.across_m[row, column] < 1e-5
-    assert placing(BROWN5, PINHOLE, only(0.6, 0, 1), SIZE, 5.0).total_m == pytest.approx(found.total_m / 2, rel=1e-6)
+    assert placing(BROWN5, PINHOLE, only(0.6, 0, 1), SIZE, 5.0).total_m == pytest.approx(
+        found.total_m / 2, rel=1e-6
+    )
 
 
 def test_a_shift_of_the_centre_is_mostly_a_turn_of_the_camera():
@@ -66,7 +68,9 @@ def test_halves_that_differ_by_chance_fit_and_others_do_not(lens):
     L = np.diag(sigma) @ np.linalg.cholesky(0.6 * np.ones((len(lens),) * 2) + 0.4 * np.eye(len(lens)))
     cov = L @ L.T
     found = [
-        difference(lens, (k + L @ rng.normal(size=len(k)), cov), (k + L @ rng.normal(size=len(k)), cov), SIZE, 10.0)
+        difference(
+            lens, (k + L @ rng.normal(size=len(k)), cov), (k + L @ rng.normal(size=len(k)), cov), SIZE, 10.0
+        )
         for _ in range(60)
     ]
     assert sum(not one.fits for one in found) <= 1

@@ -13,7 +13,9 @@ BOARD = parse_board("chessboard:3x3:0.1")
 def test_a_corner_file_is_read_with_its_levels_and_its_gaps():
     full = "\n".join(f"/far/a.png {10 * i}.5 {20 + i} {1 if i == 4 else 0}" for i in range(9))
     holes = "\n".join(f"b.png {i} {i} {'-' if i == 2 else 0}" if i != 5 else "b.png - - -" for i in range(9))
-    views, odd = views_of_corner_file(f"# filename x y level\n{full}\n{holes}\nc.png - -\nd.png 1 2 0\n", BOARD)
+    views, odd = views_of_corner_file(
+        f"# filename x y level\n{full}\n{holes}\nc.png - -\nd.png 1 2 0\n", BOARD
+    )
     assert [view.name for view in views] == ["a.png", "b.png"]
     assert odd == ["d.png"]
     assert np.allclose(views[0].uv[3, 0], [30.5, 23])
