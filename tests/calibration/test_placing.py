@@ -64,7 +64,7 @@ def test_halves_that_differ_by_chance_fit_and_others_do_not(lens):
     k = {9: np.array([600.0, 603, 318, 243, -0.2, 0.05, 0.001, -0.0005, 0.01]),
          8: np.array([400.0, 401, 318, 243, 0.03, -0.01, 0.002, -0.0004])}[len(lens)]  # fmt: skip
     rng = np.random.default_rng(9)
-    sigma = np.concatenate([[0.2, 0.2, 0.3, 0.3], np.full(len(lens) - 4, 0.002)])
+    sigma = np.concatenate([[0.2, 0.2, 0.3, 0.3], np.full(len(lens) - 4, 0.0003)])
     L = np.diag(sigma) @ np.linalg.cholesky(0.6 * np.ones((len(lens),) * 2) + 0.4 * np.eye(len(lens)))
     cov = L @ L.T
     found = [
