@@ -27,7 +27,7 @@ def test_too_few_views_are_refused():
 
 
 def test_views_that_are_all_alike_are_refused():
-    with pytest.raises(CalibrationError, match="one attitude|do not tell|to .* % only"):
+    with pytest.raises(CalibrationError, match=r"one attitude|do not tell|to .* % only"):
         calibrate_lens(BROWN5, drawn_views(BROWN5, count=12, alike=True)[0], BOARD, SIZE)
 
 
