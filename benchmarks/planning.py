@@ -168,12 +168,12 @@ def map_seconds(points: int) -> tuple[float, int]:
     return time.perf_counter() - begun, int(within.sum())
 
 
-def agreement() -> tuple[float, float] | None:
-    """Predicted and reported sigma of the sample's run, m; None where it was not made."""
-    if not (RUN / "solution.json").is_file():
+def agreement(folder: Path = RUN) -> tuple[float, float] | None:
+    """Predicted and reported sigma of a run of the sample, m; None where it was not made."""
+    if not (folder / "solution.json").is_file():
         return None
     network, site, chain = sample()
-    run = read_run(RUN, network, site)
+    run = read_run(folder, network, site)
     T = run.postures.T_world
     arm = fitted_arm(se3.inverse(T[chain.cab]) @ T[chain.stick], chain.pin_m)
     setup = Setup(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks import planning
 from benchmarks.main_job import COVERAGE_BAR, RMSE_BAR_M, SAMPLE, SIGMA_RATIO_BAR, STATION_BAR_M, Score, score
 from pipeline import resources
 from tests.estimation.conforming import faults
@@ -39,6 +40,12 @@ def test_the_cutting_edge_is_right_and_knows_how_right_it_is(sample):
 def test_every_station_lies_within_the_papers_inch(sample):
     assert len(sample.station_errors_m) >= 10
     assert sample.worst_station_m <= STATION_BAR_M
+
+
+def test_planning_says_beforehand_what_the_report_says(sample, runs):
+    predicted, reported = planning.agreement(runs / "trench")
+    print(f"predicted {1e3 * predicted:.2f} mm, reported {1e3 * reported:.2f} mm")
+    assert predicted == pytest.approx(reported, rel=0.15)
 
 
 def test_the_report_is_small_and_the_second_run_does_no_work(sample, runs):

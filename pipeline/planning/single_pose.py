@@ -116,3 +116,47 @@ def off_the_ray_deg(T_camera_marker, direction):
 def power(x, y) -> float:
     """Exponent of ``y ~ x^power``, by least squares of the logarithms."""
     return float(np.polyfit(np.log(x), np.log(y), 1)[0])
+
+
+DISTANCES_M = (3.0, 5.0, 7.0, 10.0, 14.0, 20.0)
+
+
+def by_distance(p_marker, intrinsics, sigma_of, distances_m=DISTANCES_M, tilt_deg=30.0, factor=1.0):
+    """Figs. 7 to 9 for a camera and a marker of one's own: sigmas of the marker's origin over its distance.
+
+    Parameters
+    ----------
+    p_marker : (m, 4, 3) array
+        Tags of the marker, metres.
+    intrinsics : (9,) array
+        Of the camera.
+    sigma_of : callable
+        Sigma of a corner, px, from the side of its tag, px.
+    distances_m : sequence of float
+        On the optical axis.
+    tilt_deg : float
+        Of the marker away from the camera.
+    factor : float
+        Of the focal length: another lens.
+
+    Returns
+    -------
+    sigmas : (k, 3) array
+        m, smallest first.
+    side_px : (k,) array
+        Of the largest tag.
+    off_deg : (k,) array
+        Between the largest error and the line of sight.
+    """
+    lens = np.array(intrinsics, float)
+    lens[:2] *= factor
+    side = np.linalg.norm(p_marker[:, 1] - p_marker[:, 0], axis=-1).max()
+    sigmas, sides, off = [], [], []
+    for z in distances_m:
+        T = facing(z, tilt_deg)
+        pixels = float(lens[0] * side / z * np.sqrt(np.cos(np.deg2rad(tilt_deg))))
+        found, direction = position_sigmas(T, p_marker.reshape(-1, 3), lens, float(sigma_of(pixels)))
+        sigmas.append(found)
+        sides.append(pixels)
+        off.append(float(off_the_ray_deg(T, direction)))
+    return np.array(sigmas), np.array(sides), np.array(off)

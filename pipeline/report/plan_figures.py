@@ -82,3 +82,26 @@ def map_figure(drawn: Map, x_label: str, y_label: str, words: Words, times: floa
     ax.set_ylabel(y_label)
     figure.colorbar(image, ax=ax, shrink=0.8, label=f"{words('planning.sigma')}, mm", extend="max")
     return figure
+
+
+def distance_figure(distance_m, series, words: Words) -> Figure:
+    """Largest sigma of a marker's place over its distance, one line per camera and marker, logarithmic axes."""
+    figure = new_figure(2.6)
+    ax = figure.subplots()
+    for k, (name, sigma_mm) in enumerate(series):
+        ax.loglog(
+            distance_m,
+            sigma_mm,
+            marker="osD^v"[k % 5],
+            ms=3,
+            ls=("-", "--", ":", "-.")[k % 4],
+            color=palette.ACCENTS[k % len(palette.ACCENTS)],
+            label=name,
+        )
+    ax.set_xticks(distance_m, [f"{d:g}" for d in distance_m])
+    ax.minorticks_off()
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    ax.set_xlabel(f"{words('planning.distance')}, m")
+    ax.set_ylabel("mm")
+    ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
+    return figure

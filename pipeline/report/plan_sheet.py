@@ -11,8 +11,9 @@ import numpy as np
 from pipeline.planning.changes import LOST_M
 from pipeline.planning.edge import EdgePlan
 from pipeline.planning.outcome import CANDIDATES, Map, Plan
+from pipeline.planning.single_pose import DISTANCES_M, by_distance
 from pipeline.report.numbers import column, number, table
-from pipeline.report.plan_figures import line_figure, map_figure, scale_of_ellipses
+from pipeline.report.plan_figures import distance_figure, line_figure, map_figure, scale_of_ellipses
 from pipeline.report.sheet import GOOD, POOR, Part, Picture, Sheet
 from pipeline.report.words import Words
 
@@ -41,6 +42,8 @@ def plan_sheet(
     words = Words(language)
     state, sentence = verdict(plan, words)
     parts = [_along(plan, words), _budget(plan.edge, words), _maps(plan, words), _seen(plan, words)]
+    if alone := _alone(plan, words):
+        parts.append(alone)
     if plan.gains:
         parts.append(_gains(plan, words))
     if at is not None:
@@ -229,6 +232,57 @@ def _seen(plan: Plan, words: Words) -> Part:
         for s in plan.seen
     ]
     return Part(words("planning.seen"), (), [(words("planning.seen_caption"), table(columns, rows))])
+
+
+def _alone(plan: Plan, words: Words) -> Part | None:
+    """Each camera and marker that meet, as if nothing else were there: Figs. 7 to 9 of the paper for this job."""
+    net, noise = plan.setup.network, plan.setup.looking.noise
+    rows, series = [], []
+    for pair in plan.seen:
+        if pair.share == 0:
+            continue
+        camera = next(c for c in net.cameras if c.name == pair.camera)
+        k = next(k for k, m in enumerate(net.markers) if m.name == pair.marker)
+        corners, lens = net.tag_corners[net.tag_marker == k], net.statics[camera.intrinsics].value
+        sigmas, side, off = by_distance(corners, lens, noise.sigma)
+        longer, _, _ = by_distance(corners, lens, noise.sigma, factor=1.5)
+        one, _, _ = by_distance(corners[:1], lens, noise.sigma)
+        name = f"{pair.camera}, {pair.marker}"
+        series.append((name, 1e3 * sigmas[:, 2]))
+        rows += [
+            {
+                "pair": name,
+                "z": z,
+                "side": side[i],
+                "large": 1e3 * sigmas[i, 2],
+                "small": 1e3 * sigmas[i, 0],
+                "off": off[i],
+                "one": 1e3 * one[i, 2],
+                "lens": 1e3 * longer[i, 2],
+            }
+            for i, z in enumerate(DISTANCES_M)
+        ]
+    if not series:
+        return None
+    columns = [
+        column("pair", words("planning.pair"), kind="id"),
+        column("z", words("planning.distance"), "m", 0),
+        column("side", words("planning.side"), "px", 0),
+        column("large", words("planning.largest"), "mm", 2),
+        column("small", words("planning.smallest"), "mm", 2),
+        column("off", words("planning.off"), "deg", 1),
+        column("one", words("planning.one_tag"), "mm", 2),
+        column("lens", words("planning.longer"), "mm", 2),
+    ]
+    picture = Picture(
+        "plan-alone",
+        words("planning.alone_title"),
+        words("planning.alone_good"),
+        words("planning.alone_description"),
+        partial(distance_figure, np.array(DISTANCES_M), series, words),
+        table(columns, rows),
+    )
+    return Part(words("planning.alone"), [words("planning.alone_sentence")], (), [picture])
 
 
 def _gains(plan: Plan, words: Words) -> Part:

@@ -221,7 +221,7 @@ def test_the_command_writes_a_page_and_its_numbers(tmp_path):
     for row in line:
         assert row["u"] ** 2 == pytest.approx(row["own"] ** 2 * 4 + row["common"] ** 2 * 4, rel=0.02)
     html = out.read_text(encoding="utf-8")
-    assert html.count("<svg") == 3 and "http" not in html.replace("http-equiv", "")
+    assert html.count("<svg") == 4 and "http" not in html.replace("http-equiv", "")
     again = tmp_path / "again.html"
     run_plan("--area", "106:110", "--no-search", "--at", "reach=6,depth=1.5", "--out", str(again))
     assert again.read_bytes() == out.read_bytes()

@@ -8,6 +8,7 @@ from pipeline.geometry import se3
 from pipeline.planning.single_pose import (
     SIGMA_U_PX,
     board,
+    by_distance,
     facing,
     off_the_ray_deg,
     pinhole,
@@ -90,3 +91,17 @@ def test_a_second_camera_at_a_base_takes_the_depth_down():
     two = position_sigmas(T, square(0.3), pinhole(FOCAL), T_camera_others=[base])[0][2]
     triangulated = 144 * SIGMA_U_PX * np.sqrt(2) / (FOCAL * 3.0) / np.sqrt(4)
     assert two < 0.2 * one and two == pytest.approx(triangulated, rel=0.15)
+
+
+def test_a_job_of_ones_own_is_the_same_formula():
+    """At constant sigma the square of the distance; with sigma falling as 1/side the cube."""
+    tags = square(0.4)[None]
+    z = (6.0, 9.0, 13.5)
+    constant, side, off = by_distance(tags, pinhole(FOCAL), lambda px: 0.2, z)
+    worse, _, _ = by_distance(tags, pinhole(FOCAL), lambda px: 0.2 * 40 / px, z)
+    assert power(z, constant[:, 2]) == pytest.approx(2.0, abs=0.06)
+    assert power(z, worse[:, 2]) == pytest.approx(3.0, abs=0.06)
+    assert side[1] == pytest.approx(FOCAL * 0.4 / 9 * np.sqrt(np.cos(np.pi / 6))) and off.max() < 5
+    assert by_distance(tags, pinhole(FOCAL), lambda px: 0.2, z, factor=2.0)[0][:, 2] == pytest.approx(
+        constant[:, 2] / 2, rel=0.02
+    )
