@@ -125,7 +125,7 @@ def survey_errors(rng: np.random.Generator) -> np.ndarray:
 
 def run(draws: int) -> list[dict]:
     """Rows: one per quantity, with its figures and whether they are at their bars."""
-    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count() or 1, 8)) as pool:
+    with multiprocessing.get_context("spawn").Pool(min(os.cpu_count() or 1, draws)) as pool:
         rigs = list(pool.imap(cluster_row, range(1000, 1000 + draws)))
     rng = np.random.default_rng(7)
     normalised = {

@@ -16,7 +16,6 @@ import scipy.stats
 
 from pipeline.errors import CalibrationError
 from pipeline.geometry import se3, so3
-from pipeline.network.build import rigid_fit
 
 CHANCE = 1e-3
 """A survey that fits worse than chance allows in one of a thousand is faulty."""
@@ -94,12 +93,124 @@ def marker_pose(marker: SurveyedMarker) -> MarkerPose:
     if found.chi_square > limit:
         raise CalibrationError(_fault(marker, found))
     if _faces_away(marker, found.T_world_marker):
-        orders = [order for order in _best_orders(marker) if np.any(order != named)]
+        orders = _best_orders(marker)
+        meant = f"; with {_listed(marker, orders[0])} they fit a print that can be seen" if orders else ""
+        raise CalibrationError(
+            f"marker '{marker.name}': its print would face away from where it is looked at, as if its corners were "
+            f"named in mirrored order, or seen from behind{meant}"
+        )
+    return found
+
+
+def _limit(redundancy: int) -> float:
+    return float(scipy.stats.chi2.isf(CHANCE, redundancy))
+
+
+def _fit(marker: SurveyedMarker, order: np.ndarray, rows: np.ndarray | None = None) -> MarkerPose | None:
+    """Weighted least squares with the shots taken in some order; None for points on a line."""
+    keep = np.arange(len(order)) if rows is None else rows
+    p, q, sigma = marker.p_marker[keep], marker.p_world[order][keep], marker.sigma_m[order][keep]
+    spread = np.linalg.svd(p - p.mean(0), compute_uv=False)
+    if spread[1] < 1e-9 * max(spread[0], 1e-12):
+        return None
+    T = _start(p, q)
+    weight = np.repeat(1 / sigma**2, 3)
+    for _ in range(STEPS):
+        J = _jacobian(T, p)
+        r = (q - se3.transform(T, p)).reshape(-1)
+        step = np.linalg.solve(J.T @ (weight[:, None] * J), J.T @ (weight * r))
+        T = se3.retract(T, step)
+        if np.abs(step).max() < 1e-12:
+            break
+    J = _jacobian(T, p)
+    covariance = np.linalg.inv(J.T @ (weight[:, None] * J))
+    residual = (q - se3.transform(T, p)) @ T[:3, :3]
+    # The size of the print is the one thing besides the pose that all corners can agree on being wrong.
+    ray = ((p - p.mean(0)) @ T[:3, :3].T).reshape(-1)
+    N = ray @ (weight * ray) - (ray * weight) @ J @ covariance @ J.T @ (weight * ray)
+    grown = float(ray @ (weight * (residual @ T[:3, :3].T).reshape(-1)) / N)
+    return MarkerPose(
+        marker.name,
+        T,
+        covariance,
+        residual,
+        float(np.sum(residual**2 / sigma[:, None] ** 2)),
+        3 * len(p) - 6,
+        1 + grown,
+        float(N**-0.5),
+    )
+
+
+def _start(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """The unweighted optimum (Kabsch); shots in a wrong order may leave it open, and any of its answers will do."""
+    U, _, Vt = np.linalg.svd((q - q.mean(0)).T @ (p - p.mean(0)))
+    R = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return se3.from_rotation_translation(R, q.mean(0) - R @ p.mean(0))
+
+
+def _jacobian(T: np.ndarray, p: np.ndarray) -> np.ndarray:
+    """(3n, 6) world points by ``xi``."""
+    J = np.concatenate([np.broadcast_to(np.eye(3), (len(p), 3, 3)), -so3.hat(p)], axis=-1)
+    return (T[:3, :3] @ J).reshape(-1, 6)
+
+
+def _faces_away(marker: SurveyedMarker, T: np.ndarray) -> bool:
+    return marker.faces is not None and bool(T[:3, 2] @ (marker.faces - T[:3, 3]) < 0)
+
+
+def _orders(count: int) -> list[np.ndarray]:
+    """Orders in which corners may have been meant: all of them, or exchanges of two and the reverse."""
+    if count <= MOST_ORDERED:
+        return [np.array(order) for order in permutations(range(count))]
+    orders = [np.arange(count)[::-1]]
+    for a in range(count):
+        for b in range(a):
+            order = np.arange(count)
+            order[[a, b]] = order[[b, a]]
+            orders.append(order)
+    return orders
+
+
+def _best_orders(marker: SurveyedMarker) -> list[np.ndarray]:
+    """Orders of the shots that fit the print, seen from before and upright, with fewest corners renamed.
+
+    A square print leaves two of them where nobody says from where it is seen: its left side named wrong, or its right.
+    """
+    named = np.arange(len(marker.p_marker))
+    ranked = []
+    for order in _orders(len(named)):
+        fit = _fit(marker, order)
+        if fit is None or fit.chi_square > _limit(fit.redundancy) or _faces_away(marker, fit.T_world_marker):
+            continue
+        lying = abs(fit.T_world_marker[2, 2]) > 1 - UPRIGHT
+        hangs = lying or fit.T_world_marker[2, 1] > UPRIGHT
+        ranked.append((not hangs, int(np.sum(order != named)), fit.chi_square, order))
+    best = min((entry[:2] for entry in ranked), default=None)
+    return [entry[3] for entry in ranked if entry[:2] == best]
+
+
+def _listed(marker: SurveyedMarker, order: Sequence[int] | np.ndarray) -> str:
+    """``101 is TR, 102 is TL``, of those that are renamed."""
+    return ", ".join(
+        f"{marker.corners[shot]} is {marker.corners[k]}" for k, shot in enumerate(order) if k != shot
+    )
+
+
+def _fault(marker: SurveyedMarker, found: MarkerPose) -> str:
+    """What is most likely wrong, in a sentence."""
+    named = np.arange(len(marker.p_marker))
+    worst_mm = 1000 * float(np.linalg.norm(found.residual, axis=1).max())
+    off = f"marker '{marker.name}': its corners do not fit its print, the worst is {worst_mm:.0f} mm off"
+    orders = [order for order in _best_orders(marker) if np.any(order != named)]
     if orders:
         renamed = [np.flatnonzero(order != named) for order in orders]
         if len(renamed[0]) == 2:
             pairs = " or ".join(f"{marker.corners[a]} and {marker.corners[b]}" for a, b in renamed)
-            which = "" if len(orders) == 1 else "; say with --station from where it was shot, and one of them remains"
+            which = (
+                ""
+                if len(orders) == 1
+                else "; say with --station from where it was shot, and one of them remains"
+            )
             listed = " or ".join(_listed(marker, order) for order in orders)
             return f"{off}; corners {pairs} are exchanged: with {listed} they fit{which}"
         return f"{off}; they fit in another order: {_listed(marker, orders[0])}"

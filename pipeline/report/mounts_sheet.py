@@ -175,5 +175,9 @@ def _circle(told: ToldPose, words: Words) -> Picture:
 
     name = told.key.split(".")[1]
     return Picture(
-        f"circle-{name}", words("mounts.picture", name=name), words("mounts.picture_good"), words("mounts.picture_seen"), draw
-    )  # fmt: skip
+        f"circle-{name}",
+        words("mounts.picture", name=name),
+        words("mounts.picture_good"),
+        words("mounts.picture_seen"),
+        draw,
+    )

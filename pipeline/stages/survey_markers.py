@@ -115,8 +115,8 @@ def surveyed_markers(
         if read is None:
             if str(point) in layout:
                 raise CalibrationError(
-                    f"{source}: '{named}', as point {point} is said to be, is no corner of a marker of site.toml; write "
-                    f"such as {_example(site)}"
+                    f"{source}: '{named}', as point {point} is said to be, is no corner of a marker of site.toml; "
+                    f"write such as {_example(site)}"
                 )
             unread.append(str(point))
             continue

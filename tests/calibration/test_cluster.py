@@ -135,7 +135,7 @@ def test_the_machine_is_cut_down_to_the_cluster_and_wrong_references_are_named(y
     assert list(cut.bodies) == ["cab"] and not cut.markers and not cut.sensors
     assert cut.cameras["bench"].mount is None
     assert np.all(cut.cameras["arm"].mount.covariance_xi() == 0)
-    with pytest.raises(CalibrationError, match="no camera 'left' in machine.toml; known are bench, arm"):
+    with pytest.raises(CalibrationError, match=r"no camera 'left' in machine\.toml; known are bench, arm"):
         cluster_machine(machine, "left")
     cameras = {**machine.cameras, "arm": machine.cameras["arm"].model_copy(update={"body": "stick"})}
     with pytest.raises(CalibrationError, match="'bench' is alone on 'cab'"):

@@ -116,10 +116,9 @@ def test_a_mirrored_order_is_named_where_it_is_known_from_where_the_print_is_see
 def test_a_typing_error_is_named_with_its_size():
     q = shot(PRINT, rng=np.random.default_rng(2))
     q[2, 1] += 0.100
-    with pytest.raises(CalibrationError) as error:
+    # The shots' own noise is in it: 1 mm a coordinate, some more in the prediction from three.
+    with pytest.raises(CalibrationError, match=r"corner BR lies (9[5-9]|10[0-5]) mm from .* northing \+"):
         marker_pose(marker(q))
-    assert "corner BR lies 100 mm from where" in str(error.value) or "corner BR lies 10" in str(error.value)
-    assert "northing +" in str(error.value)
 
 
 def test_a_print_of_another_size_is_named():
