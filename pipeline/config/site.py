@@ -8,19 +8,16 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
+from pipeline.config.benchmark import Benchmark
 from pipeline.config.checks import Checks
 from pipeline.config.quantities import (
-    Calibrated,
     Identifier,
     Name,
     NonNegative,
     Pose,
     Positive,
-    Print,
     Section,
-    SigmaTriple,
     Triple,
-    check_covariance,
 )
 from pipeline.config.utility import MAX_UTILITIES, Utility
 
@@ -63,73 +60,6 @@ class Grid(Section):
     def to_grid_metres(self, p_world: np.ndarray) -> np.ndarray:
         """World metres (..., 3) -> grid easting, northing, elevation in metres (..., 3)."""
         return np.asarray(p_world, float) + np.array(self.origin) * self.metres_per_unit
-
-
-class SurveyedPose(Section):
-    """A marker's pose in the grid."""
-
-    enh: Triple
-    """Easting, northing, elevation of the marker's centre, grid unit."""
-    rpy_deg: Triple
-    """``R_grid_marker = Rz(yaw) @ Ry(pitch) @ Rx(roll)``, degrees."""
-    sigma_mm: SigmaTriple | NonNegative | None = None
-    """Of the centre, along the marker's axes."""
-    sigma_deg: SigmaTriple | NonNegative | None = None
-    """Of the rotation, about the marker's axes."""
-    covariance: tuple[tuple[float, ...], ...] | None = None
-    """6x6 covariance of ``xi = [rho, phi]`` in m and rad instead of the two sigmas."""
-    calibrated: Calibrated | None = None
-
-    @model_validator(mode="after")
-    def _one_uncertainty(self) -> SurveyedPose:
-        if (self.sigma_mm is not None and self.sigma_deg is not None) == (self.covariance is not None):
-            raise ValueError(
-                "give either sigma_mm and sigma_deg, or covariance (6x6); a surveyed pose is not exact by default"
-            )
-        if self.covariance is not None:
-            check_covariance(self.covariance, 6)
-        return self
-
-
-class SurveyedCorner(Section):
-    """One corner of a printed tag, shot with the total station."""
-
-    tag: Annotated[int, Field(ge=0)]
-    corner: Annotated[int, Field(ge=0, le=3)]
-    """0 top-left, 1 top-right, 2 bottom-right, 3 bottom-left of the print."""
-    enh: Triple
-
-
-class Benchmark(Print):
-    """A marker fixed on the site: its surveyed pose, or three or more surveyed corners; neither: the log must tell."""
-
-    pose: SurveyedPose | None = None
-    corners: tuple[SurveyedCorner, ...] = ()
-    sigma_corner_mm: Positive | None = None
-
-    @model_validator(mode="after")
-    def _one_survey(self) -> Benchmark:
-        if self.pose is not None and self.corners:
-            raise ValueError(
-                "give either pose, or at least three surveyed corners with sigma_corner_mm, or neither: "
-                "then the log must tell where the marker is"
-            )
-        if not self.corners and self.sigma_corner_mm is not None:
-            raise ValueError("sigma_corner_mm goes with surveyed corners, and there are none")
-        if self.corners and (len(self.corners) < 3 or self.sigma_corner_mm is None):
-            raise ValueError("surveyed corners need at least three of them and sigma_corner_mm")
-        ids = {tag.id for tag in self.tags}
-        for shot in self.corners:
-            if shot.tag not in ids:
-                raise ValueError(
-                    f"a corner of tag {shot.tag} was surveyed, but the tags of this benchmark are {sorted(ids)}"
-                )
-        return self
-
-    @property
-    def is_surveyed(self) -> bool:
-        """False where the log alone must tell its pose."""
-        return self.pose is not None or bool(self.corners)
 
 
 class Alignment(Section):

@@ -7,10 +7,10 @@ import datetime
 import numpy as np
 
 from pipeline.config import Machine, Site
+from pipeline.config.benchmark import Benchmark
 from pipeline.config.machine import JointBody, Motion, StaticBody
 from pipeline.config.prints import described_tags
 from pipeline.config.quantities import Pose, Print
-from pipeline.config.site import Benchmark
 from pipeline.errors import NetworkError
 from pipeline.geometry import camera as camera_model
 from pipeline.geometry import linkage, se3, so3
