@@ -17,7 +17,6 @@ from pipeline.config.quantities import (
     Pose,
     Positive,
     Section,
-    Triple,
 )
 from pipeline.config.utility import MAX_UTILITIES, Utility
 
