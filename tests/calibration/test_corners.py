@@ -82,6 +82,7 @@ def test_tags_that_a_board_has_not_are_named():
     assert "DICT_4X4_50" in finder.instead()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("upwards", [False, True], ids=["downwards", "upwards"])
 @pytest.mark.parametrize("turned", [False, True], ids=["upright", "turned"])
 def test_a_grid_of_tags_is_laid_out_as_it_is_printed(upwards, turned):
