@@ -31,6 +31,11 @@ def curves(x, series: Sequence[tuple[str, np.ndarray]], x_label: str) -> Figure:
         ax.loglog(
             x, y, marker="o", ms=2.5, ls=("-", "--", ":", "-.")[k % 4], color=palette.ACCENTS[k], label=name
         )
+    # The page draws no mathematics: powers of ten as plain numbers, at places of our own.
+    places = np.asarray(x)[:: max(len(x) // 6, 1)]
+    ax.set_xticks(places, [f"{p:.3g}" for p in places])
+    ax.minorticks_off()
+    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.set_xlabel(x_label)
     ax.set_ylabel("sigma, mm")
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
