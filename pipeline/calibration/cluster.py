@@ -178,6 +178,7 @@ def _refuse_unshared(network: Network, shared: np.ndarray, reference: int) -> No
                 f"camera '{name}' saw no marker of the site in this log; check its topic and that markers of site.toml "
                 "were before it"
             )
+    for k, name in enumerate(names):
         others = shared[k].copy()
         others[k] = 0
         if others.max() == 0:
