@@ -125,7 +125,8 @@ def test_a_camera_that_saw_nothing_and_too_few_views_are_named(yard):
 
 def test_a_print_of_another_size_contradicts_the_pictures(yard):
     drawn, _, site, network = yard
-    with pytest.raises(CalibrationError, match="the pictures contradict the files"):
+    # Where it is off by this much the adjustment may not even end; either way the size is named.
+    with pytest.raises(CalibrationError, match=r"contradicts? the (files|log).* size"):
         cluster_of(network, seen(drawn, network, np.random.default_rng(0), scale=1.05), site, "bench")
 
 
