@@ -40,7 +40,8 @@ from pipeline.tracks.poses import cutting_edge
 from pipeline.tracks.table import states_from_columns
 
 DRAWS = 50
-SIGMA_PX = 0.06
+SIGMA_PX = 0.03
+"""As corners of the rendered log scatter."""
 NODES = 9
 DAY = datetime.date(2025, 6, 15)
 RMS, COVERAGE, WITHIN_DEG = (0.85, 1.15), (92.0, 98.0), 0.2

@@ -79,7 +79,12 @@ def machine_to_the_pin(machine: Machine) -> tuple[Machine, str]:
             f"camera '{carried[0]}' is carried by the bucket; its angle cannot be told from where it looks"
         )
     exact = Pose(xyz_m=body.axis.xyz_m, rpy_deg=body.axis.rpy_deg, sigma_mm=0.0, sigma_deg=0.0)
-    edge = EdgeSection(body=body.parent, mount=exact, width_m=machine.cutting_edge.width_m)
+    # What epochs share is gathered for the ends of the edge: as far from the pin as the bucket reaches, so that the
+    # turns of the stick, which its edge feels so far away, are in there too.
+    reach = float(np.hypot(*machine.cutting_edge.mount.xyz_m[:2]))
+    edge = EdgeSection(
+        body=body.parent, mount=exact, width_m=2 * max(reach, 0.5 * machine.cutting_edge.width_m)
+    )
     reduced = machine.model_copy(
         update={
             "bodies": {name: other for name, other in machine.bodies.items() if name not in gone},

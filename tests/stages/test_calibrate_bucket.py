@@ -170,6 +170,9 @@ def test_the_machine_ends_at_the_pin(machine, site):
     tool = network.statics[network.tool]
     np.testing.assert_allclose(tool.value, machine.bodies["bucket"].axis.transform())
     assert np.all(tool.covariance == 0) and network.tool_body == "stick"
+    # Its ends are as far from the pin as the bucket reaches: what turns them is shared, not each epoch's own.
+    reach = np.hypot(*machine.cutting_edge.mount.xyz_m[:2])
+    assert network.edge_m == pytest.approx(2 * reach)
 
 
 def test_a_bucket_without_an_angle_is_refused(text):
