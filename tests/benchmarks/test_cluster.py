@@ -35,4 +35,27 @@ def test_corners_lie_where_opencv_puts_them(finder):
 def test_with_exact_files_only_the_pictures_are_left(finder, monkeypatch):
     monkeypatch.setattr(_cluster, "true_static", lambda rng, static: static.value)
     found = trial(Arrangement(), finder, np.random.default_rng(2))
-    assert found.tags == 4 and abs(found.error_m) < 0.002
+    # Tags that come out 0.01 px too low in height tilt the surveyed board, 7 m away, by half a milliradian: 4 mm.
+    assert found.tags == 4 and abs(found.error_m) < 0.008
+
+
+def test_with_perfect_corners_nothing_is_left(finder, monkeypatch):
+    """The way from corners to depth by itself, against OpenCV's pictures of the true poses."""
+    drawn = {}
+
+    def draw(board, T_camera_marker, intrinsics, rng):
+        drawn.update(T=T_camera_marker, lens=intrinsics)
+        return rendered(board, T_camera_marker, intrinsics, rng)
+
+    def find(grey, *others):
+        seen = search(grey, *others)
+        net = network(Arrangement())
+        for k, number in enumerate(seen.tag_id):
+            tag = int(net.tag_index([FAMILY], [int(number)])[0])
+            seen.uv[k] = picture(drawn["T"], net.tag_corners[tag], drawn["lens"])
+        return seen
+
+    monkeypatch.setattr(_cluster, "true_static", lambda rng, static: static.value)
+    monkeypatch.setattr(_cluster, "rendered", draw)
+    monkeypatch.setattr(_cluster, "search", find)
+    assert abs(trial(Arrangement(), finder, np.random.default_rng(2)).error_m) < 1e-6
