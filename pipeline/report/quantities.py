@@ -85,7 +85,11 @@ def _job_volumes(inputs: ReportInputs, found: list[dict], units: Units, words: W
         )
     elsewhere = inputs.survey.get("left_where_not_cut")
     if elsewhere is not None:
-        rows.append({"kind": words("volumes.left_where_not_cut"), "volume": units.to_volume(elsewhere)})
+        # Below the volume it is a part of.
+        of_left = [volume["kind"] for volume in found].index("left to cut") + 1
+        rows.insert(
+            of_left, {"kind": words("volumes.left_where_not_cut"), "volume": units.to_volume(elsewhere)}
+        )
     return numbers.table(_volume_columns(units, words), rows)
 
 

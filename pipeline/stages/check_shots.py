@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
 from pipeline.config.checks import Checks
+from pipeline.config.site import Site
 from pipeline.estimation.sensitivities import Sensitivities
 from pipeline.estimation.table import sensitivities_from_columns
-from pipeline.stages.job import Job
+from pipeline.stages.job import Job, NamedFile
 from pipeline.surface.alignment import Alignment
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.checks import (
@@ -34,16 +36,18 @@ from pipeline.surface.telling_shot import telling_shot
 from pipeline.tracks.poses import CuttingEdge
 
 
-def shots_of(job: Job, design: Design, alignment: Alignment) -> Shots | None:
-    """The check shots, if the site has any; their order is checked against where the trench is."""
-    checks = job.site.checks
+def shots_of(
+    site: Site, files: Mapping[str, NamedFile], design: Design, alignment: Alignment
+) -> Shots | None:
+    """The check shots, if the site has any; their order is checked against where the trench is. Raises SurfaceError."""
+    checks = site.checks
     if checks is None:
         return None
-    scale, zone = job.site.grid.metres_per_unit, job.site.report.time_zone
-    shots = read_shots(job.files["checks"].path, checks.order, scale, zone, checks.codes)
+    scale, zone = site.grid.metres_per_unit, site.report.time_zone
+    shots = read_shots(files["checks"].path, checks.order, scale, zone, checks.codes)
     first, last = design.station_range()
     stretch = alignment.points(np.linspace(first, last, 200), 0.0)
-    check_order(shots, stretch.min(axis=0), stretch.max(axis=0), checks.order, job.files["checks"].name)
+    check_order(shots, stretch.min(axis=0), stretch.max(axis=0), checks.order, files["checks"].name)
     return shots
 
 

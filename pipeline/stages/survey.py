@@ -120,7 +120,7 @@ def run(job: Job, progress: Progress) -> Counts:
     design, alignment = read_design(job.files["design"].path, site)
     ground_file = job.files.get("ground")
     ground = read_ground(ground_file.path if ground_file else None, site, alignment)
-    shots = check_shots.shots_of(job, design, alignment)
+    shots = check_shots.shots_of(site, job.files, design, alignment)
     buried = read_utilities(site, {key: file.path for key, file in job.files.items()})
     progress.advance()
 

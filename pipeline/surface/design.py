@@ -218,6 +218,10 @@ def floor_sentence(design: Design) -> str:
     )
 
 
+FROM_BENCHMARKS_M = 40.0
+"""No machine digs so far below, or above, the boards it sees."""
+
+
 def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
     """The design and the alignment of a site, in grid metres, checked against the site's origin.
 
@@ -260,7 +264,26 @@ def read_design(path: Path, site: Site) -> tuple[Design, Alignment]:
         )
     level = design.floor_level(np.linspace(first, last, 50))
     check_elevation(level, origin_m[2], path.name, scale)
+    _check_against_benchmarks(level, site, path.name)
     return design, alignment
+
+
+def _check_against_benchmarks(level: np.ndarray, site: Site, source: str) -> None:
+    """Raise SurfaceError where the floor lies far from every surveyed benchmark: elevations in feet, say."""
+    scale = site.grid.metres_per_unit
+    surveyed = [
+        point[2] * scale
+        for mark in site.benchmarks.values()
+        for point in ([mark.pose.enh] if mark.pose else [corner.enh for corner in mark.corners])
+    ]
+    floor = float(np.nanmedian(level))
+    away = min((abs(floor - height) for height in surveyed), default=0.0)
+    if away > FROM_BENCHMARKS_M:
+        nearest = min(surveyed, key=lambda height: abs(floor - height))
+        raise SurfaceError(
+            f"{source}: the design floor lies at {floor / scale:.2f}, {away:.0f} m from the nearest benchmark "
+            f"({nearest / scale:.2f}): one of them is in another unit or height datum; correct the elevations"
+        )
 
 
 def _of_landxml(landxml: LandXml, given: Alignment | None, site: Site) -> tuple[Design, Alignment]:

@@ -1,8 +1,8 @@
 """Where the common part of each station's sigma comes from, by the groups of the error budget.
 
 The adjustment tells it of the cutting edge's elevation at each instant (`estimation.sensitivities`); a station rests on
-the passes that are the lowest over its cells, so its budget is that of their instants. A floor with a gradient has a
-little more: what errors in plan do to it is in the station's sigma and in no group.
+the passes that are the lowest over its cells, so its budget is that of their instants. Where the edge rose or fell, an
+error in plan is one of height too: what the station's common sigma has beyond the groups is told as that.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import numpy as np
 from pipeline.estimation.sensitivities import BUDGET, Sensitivities
 from pipeline.surface.as_built import AsBuilt
 from pipeline.surface.shot_errors import between
+
+IN_PLAN = "errors in plan, where the edge rose or fell"
 
 
 @dataclass(frozen=True)
@@ -45,9 +47,10 @@ def station_budget(
     """
     groups = () if answer is None else tuple(k for k, s in enumerate(answer.sources) if s.kind == BUDGET)
     names = () if answer is None else tuple(answer.sources[k].name for k in groups)
-    sigma = np.full((len(station), len(groups)), np.nan)
     if answer is None or not groups:
-        return StationBudget(station, names, sigma)
+        return StationBudget(station, names, np.full((len(station), 0), np.nan))
+    names = (*names, IN_PLAN)
+    sigma = np.full((len(station), len(names)), np.nan)
     variance = answer.response[:, list(groups), 2].astype(np.float64) ** 2
     edges = np.searchsorted(
         built.grid.station, np.concatenate([station - 0.5 * step_m, station[-1:] + 0.5 * step_m])
@@ -60,5 +63,7 @@ def station_budget(
         before, share = between(answer.time_ns, built.lowest_time_ns[rows][cut])
         after = np.minimum(before + 1, len(answer.time_ns) - 1)
         at = (1.0 - share[:, None]) * variance[before] + share[:, None] * variance[after]
-        sigma[i] = np.sqrt(at.mean(axis=0))
+        whole = float(built.sigma_common[rows][cut].mean()) ** 2
+        rest = max(whole - float(at.mean(axis=0).sum()), 0.0)
+        sigma[i] = np.sqrt([*at.mean(axis=0), rest])
     return StationBudget(station, names, sigma)

@@ -74,7 +74,7 @@ class Volumes:
     not_reached_m3: float
     """Part of the job's left to cut that lies where no cell was cut; nan without a ground."""
     uncut_m2: float
-    """Plan area of the designed floor in the visited stretch where no cell was cut."""
+    """Plan area of the designed floor between the first and the last row of cells that was cut, where none was."""
     groundless_m2: float
     """Plan area of cut cells and floor over which a known ground does not reach: no volume holds what lies there."""
 
@@ -171,19 +171,26 @@ def volumes(
     border = np.searchsorted(
         grid.station, np.concatenate([station - 0.5 * step_m, station[-1:] + 0.5 * step_m])
     )
-    of_station = tuple(over_rows(slice(border[i], border[i + 1])) for i in range(len(station)))
+    half = 0.5 * step_m
+    outside = [
+        (0.0, 0.0) if ground is None else _undug(built, design, ground, (s - half, s + half)) for s in station
+    ]
+    of_station = tuple(over_rows(slice(border[i], border[i + 1]), *outside[i]) for i in range(len(station)))
     elsewhere = plan = 0.0
     if ground is not None:
         ends = (float(station[0] - 0.5 * step_m), float(station[-1] + 0.5 * step_m))
         elsewhere, plan = _undug(built, design, ground, ends)
     job = over_rows(slice(0, grid.rows), elsewhere, plan)
     floor = built.floor & np.isfinite(built.design_h)
+    # Beyond the first and the last row that was cut there is no in between.
+    dug = np.flatnonzero((floor & built.cut).any(axis=1))
+    between = floor[dug[0] : dug[-1] + 1] & ~built.cut[dug[0] : dug[-1] + 1] if len(dug) else floor[:0]
     return Volumes(
         job=job,
         station=station,
         of_station=of_station,
         not_reached_m3=elsewhere + float(untouched.sum()) * area if ground is not None else np.nan,
-        uncut_m2=np.count_nonzero(floor & ~built.cut) * area,
+        uncut_m2=np.count_nonzero(between) * area,
         groundless_m2=0.0
         if ground is None
         else np.count_nonzero((built.cut | floor) & np.isnan(ground_h)) * area,

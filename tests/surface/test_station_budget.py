@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.estimation.sensitivities import Sensitivities, Source
 from pipeline.surface.as_built import as_built
-from pipeline.surface.station_budget import station_budget
+from pipeline.surface.station_budget import IN_PLAN, station_budget
 
 T0_NS = 1_750_000_000_000_000_000
 
@@ -14,7 +14,7 @@ def test_a_station_has_the_budget_of_the_passes_it_rests_on(trench):
     # Two halves, dug ten seconds apart: the benchmarks' part grows from 2 to 4 mm in between, the teeth's stays.
     t = np.concatenate([np.arange(0, 3, 0.05), 10 + np.arange(0, 3, 0.05)])
     station = np.concatenate([np.linspace(2.0, 4.8, 60), np.linspace(5.2, 8.0, 60)])
-    edge = trench.edge(t, station, 0.0, 50.0, sigma=0.003)
+    edge = trench.edge(t, station, 0.0, 50.0, sigma=0.003, common=0.005)
     built = as_built(edge, trench.alignment, trench.design, 0.1)
     sources = (
         Source("wear", "", "", "m"),
@@ -29,9 +29,11 @@ def test_a_station_has_the_budget_of_the_passes_it_rests_on(trench):
     answer = Sensitivities(first + np.array([0, 4, 10]) * 10**9, sources, response)
     where = np.arange(0.5, 9.6, 0.5)
     budget = station_budget(built, answer, where, 0.5)
-    assert budget.sources == ("benchmarks", "cutting edge")
+    assert budget.sources == ("benchmarks", "cutting edge", IN_PLAN)
     assert np.isnan(budget.sigma[[0, -1]]).all()
-    np.testing.assert_allclose(budget.sigma[[6, 12]], [[0.002, 0.001], [0.004, 0.001]], rtol=1e-6)
+    np.testing.assert_allclose(budget.sigma[[6, 12], :2], [[0.002, 0.001], [0.004, 0.001]], rtol=1e-6)
+    # With the rest they are the station's common sigma.
+    np.testing.assert_allclose(np.sum(budget.sigma[[6, 12]] ** 2, axis=1), 0.005**2, rtol=1e-5)
     # Variances are what is interpolated: half-way between 2 and 4 mm they are 3.16.
     between = Sensitivities(first + np.array([0, 4, 17]) * 10**9, sources, response)
     rows = (built.grid.station >= where[12] - 0.25) & (built.grid.station < where[12] + 0.25)

@@ -149,3 +149,14 @@ def test_ground_that_ends_inside_the_trench_is_told(trench):
     found, _ = of(trench, trench.passes([50.0]), Ground(Half(), 0.01))
     assert found.groundless_m2 > 2.0
     assert of(trench, trench.passes([50.0]))[0].groundless_m2 == 0.0
+
+
+def test_stations_add_up_to_the_job_and_what_is_in_between_ends_with_the_digging(trench):
+    # Dug from 2 to 8 of ten metres: the ends are left, by station as by job.
+    found, _ = of(trench, trench.passes([50.0]))
+    for k, volume in enumerate(found.job):
+        assert sum(parts[k].m3 for parts in found.of_station) == pytest.approx(
+            volume.m3, rel=1e-3, abs=1e-3
+        ), volume.kind
+    assert found.of_station[1][1].m3 == pytest.approx(0.5 * 1.0 * 2.0, rel=1e-2)
+    assert found.uncut_m2 == 0.0

@@ -17,6 +17,8 @@ import numpy as np
 
 from pipeline.config import Machine, Site
 from pipeline.errors import DetectionError, LogError, PipelineError, UsageError
+from pipeline.preflight.files import file_findings
+from pipeline.preflight.finding import Finding, Level
 from pipeline.runs import RunFolder
 from pipeline.stages.job import Source, check_log_file, describe, named_files
 
@@ -28,16 +30,6 @@ PLACES = 16
 MESSAGES_PER_PLACE = 5
 CLOCKS_APART_S = 1.0
 """Two sources whose stamps differ by more against the recorder's clock are not on one clock."""
-
-Level = Literal["ok", "warning", "error"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One sentence about the log, with what to do where something is amiss."""
-
-    level: Level
-    sentence: str
 
 
 @dataclass
@@ -85,7 +77,7 @@ def _look(log: Path, machine_file: Path | None, site_file: Path | None) -> Itera
         )
         for source in (machine_source, site_source):
             yield Finding("ok", f"{source.name}: read ({source.origin})")
-        yield from _file_findings(site, site_source)
+        yield from file_findings(site, site_source)
         seen = Seen()
         yield from _topic_findings(reader, machine, seen)
         if seen.frames:
@@ -108,50 +100,6 @@ def _log_findings(reader: LogReader) -> Iterator[Finding]:
     yield Finding("ok", f"{reader.path.name}: {length_s:,.1f} s, {megabytes:,.1f} MB")
     if not reader.recovery.complete:
         yield Finding("warning", f"{reader.recovery.sentence}; a report is made of what is there")
-
-
-def _file_findings(site: Site, source: Source) -> Iterator[Finding]:
-    """Whether the files that site.toml names are there and can be read."""
-    try:
-        files = named_files(site, source, RunFolder(Path()))
-    except PipelineError as error:
-        yield Finding("error", str(error))
-        return
-    from pipeline.surface.design import read_design
-
-    try:
-        read_design(files["design"].path, site)
-    except PipelineError as error:
-        yield Finding("error", str(error))
-        return
-    yield Finding("ok", f"{files['design'].name}: the design and its alignment can be read")
-    from pipeline.surface.utilities import read_utilities
-
-    try:
-        buried = read_utilities(site, {key: file.path for key, file in files.items()})
-    except PipelineError as error:
-        yield Finding("error", str(error))
-        return
-    if buried:
-        yield Finding(
-            "ok", f"{len(buried)} buried utilities: {', '.join(utility.name for utility in buried[:8])}"
-        )
-    if site.checks is None:
-        yield Finding(
-            "warning",
-            "site.toml names no check shots: the report will have no independent check of its accuracy; "
-            "shoot some points of the floor with the total station and name the file in [checks]",
-        )
-        return
-    from pipeline.surface.shots import read_shots
-
-    try:
-        scale, zone = site.grid.metres_per_unit, site.report.time_zone
-        shots = read_shots(files["checks"].path, site.checks.order, scale, zone, site.checks.codes)
-    except PipelineError as error:
-        yield Finding("error", str(error))
-        return
-    yield Finding("ok", f"{files['checks'].name}: {len(shots)} check shots")
 
 
 def _topic_findings(reader: LogReader, machine: Machine, seen: Seen) -> Iterator[Finding]:
