@@ -13,6 +13,9 @@ from pipeline.errors import CalibrationError
 
 LEAST_TOUCHES = 5
 LEAST_TURN_DEG = 40.0
+HOVERED = "stand near the point without touching it"
+HOVERED_M = 0.03
+"""A stand that nobody gave a time for, and whose edge was further from the point than this, was no touch."""
 
 
 def agreed(
@@ -20,7 +23,7 @@ def agreed(
     stands: Sequence[Stand],
     touches: Sequence[Touch],
     points: Mapping[str, float],
-    left_out: Mapping[str, int] | None = None,
+    left_out: dict[str, int] | None = None,
 ) -> Adjusted:
     """The adjustment of touches that agree.
 
@@ -30,8 +33,8 @@ def agreed(
         As for `bucket.adjust`.
     points : mapping
         Known points in the order of their numbers: name -> sigma of each coordinate, metres.
-    left_out : mapping, optional
-        What else was in the file, by reason, for the message.
+    left_out : dict, optional
+        What else was in the file, by reason, for the message; stands that were no touches are counted here.
 
     Raises
     ------
@@ -51,6 +54,11 @@ def agreed(
     try:
         robust = bucket.robust(rig, stands, touches, list(points.values()))
         worst = suspects(robust, len(points))
+        if worst and worst[0].wrong and _hovered(robust, worst[0]):
+            left_out = {} if left_out is None else left_out
+            left_out[HOVERED] = left_out.get(HOVERED, 0) + 1
+            stands, touches = bucket.left(stands, touches, worst[0].touch)
+            return agreed(rig, stands, touches, points, left_out)
         if worst and worst[0].wrong:
             raise CalibrationError(_named(robust, points, worst[0]))
         adjusted = bucket.adjust(rig, stands, touches, list(points.values()))
@@ -82,6 +90,10 @@ def kept_of(adjusted: Adjusted, name: str) -> curve_fit.Written:
             "in machine.toml, or touch at more bucket angles"
         )
     return kept
+
+
+def _hovered(found: Adjusted, worst: Suspect) -> bool:
+    return worst.touch >= 0 and not found.touches[worst.touch].by_time and abs(worst.size_m) > HOVERED_M
 
 
 def _named(adjusted: Adjusted, points: Mapping[str, float], worst: Suspect) -> str:

@@ -303,10 +303,14 @@ def _symmetric_root(covariance: np.ndarray) -> np.ndarray:
 
 def without(found: Adjusted, touch: int, points: Sequence[float]) -> Adjusted:
     """The same adjustment with one touch left out; its stand goes too if no other touch is at it."""
-    touches = [t for i, t in enumerate(found.touches) if i != touch]
-    used = sorted({t.stand for t in touches})
-    stands = [found.stands[k] for k in used]
-    return robust(found.rig, stands, [replace(t, stand=used.index(t.stand)) for t in touches], points)
+    return robust(found.rig, *left(found.stands, found.touches, touch), points)
+
+
+def left(stands: Sequence[Stand], touches: Sequence[Touch], touch: int) -> tuple[list[Stand], list[Touch]]:
+    """Stands and touches without one touch, and without its stand if no other touch is at it."""
+    kept = [t for i, t in enumerate(touches) if i != touch]
+    used = sorted({t.stand for t in kept})
+    return [stands[k] for k in used], [replace(t, stand=used.index(t.stand)) for t in kept]
 
 
 def predicted(found: Adjusted, stand: Stand, touch: Touch) -> np.ndarray:

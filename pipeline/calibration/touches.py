@@ -70,6 +70,8 @@ class Touch:
     """Index of the known point, whose own error all its touches share; -1 for a shot of its own."""
     edge_point: str = "middle"
     """left, middle, right, or empty: anywhere along the edge, and nothing is told along it."""
+    by_time: bool = True
+    """False where only its place says that this was a touch: the edge may as well have hovered nearby."""
 
 
 @dataclass(frozen=True, eq=False)

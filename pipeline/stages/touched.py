@@ -257,7 +257,13 @@ def touched(
     number: dict[str, int] = {}
 
     def add(
-        standing: int, name: str, p_grid: np.ndarray, sigma: float, point: str | None, edge_point: str
+        standing: int,
+        name: str,
+        p_grid: np.ndarray,
+        sigma: float,
+        point: str | None,
+        edge_point: str,
+        by_time: bool,
     ) -> None:
         if standing not in used:
             used[standing] = len(out.stands)
@@ -275,6 +281,7 @@ def touched(
             contact_m if k >= 0 else sigma,
             k,
             edge_point,
+            by_time,
         )
         out.touches.append(at)
         out.times_ns.append((found[standing].first_ns + found[standing].last_ns) // 2)
@@ -305,11 +312,19 @@ def touched(
                 _count(out, "second row of one touch")
                 continue
             taken.add(key)
-            add(k, name, p, sigma, name if kind == "control" else None, edge_point)
+            add(
+                k,
+                name,
+                p,
+                sigma,
+                name if kind == "control" else None,
+                edge_point,
+                shots.time_ns[i] != NO_TIME,
+            )
     named = {str(shots.point[i]) for i in range(len(shots)) if shots.kind[i] == "control"}
     for name, point in known.items():
         for k in () if name in named else _near(found, point.p_grid - origin_m, reach_m, width_m, radius_m):
-            add(k, name, point.p_grid, point.sigma_m, name, tooth)
+            add(k, name, point.p_grid, point.sigma_m, name, tooth, False)
     return out
 
 

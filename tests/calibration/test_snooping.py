@@ -115,3 +115,21 @@ def test_a_curve_that_turns_back_is_refused():
     found = bucket.adjust(d.rig, d.stands, d.touches, list(d.points.values()))
     with pytest.raises(CalibrationError, match="turns back within the stroke"):
         kept_of(found, "pot")
+
+
+def test_a_stand_that_hovered_is_no_touch_and_one_that_was_noted_is_an_error():
+    d = drawn(2001)
+    touches = [replace(t, by_time=False) for t in d.touches]
+    touches[2] = replace(touches[2], p_world=touches[2].p_world + [0, 0, 0.35])
+    left_out = {}
+    found = agreed(d.rig, d.stands, touches, d.points, left_out)
+    assert [t.name for t in found.touches] == [t.name for i, t in enumerate(d.touches) if i != 2]
+    assert len(found.stands) == 7 and left_out == {"stand near the point without touching it": 1}
+    touches[2] = replace(touches[2], by_time=True)
+    with pytest.raises(CalibrationError, match="the elevation of touch 'touch 2'"):
+        agreed(d.rig, d.stands, touches, d.points)
+    near = replace(
+        d.touches[2], by_time=False, p_world=d.touches[2].p_world + [0, 0, 0.02]
+    )  # slipped, not hovered
+    with pytest.raises(CalibrationError, match="does not go with the others"):
+        agreed(d.rig, d.stands, [*d.touches[:2], near, *d.touches[3:]], d.points)

@@ -152,6 +152,7 @@ def test_a_point_without_times_is_where_the_edge_could_reach_it():
     found[2].stand.T_world_axis[2, 3] = 2.0
     told = associate(found, rows("control", [None]))
     assert [x.stand for x in told.touches] == [0] and told.stands[0].name == "00:00:10"
+    assert not told.touches[0].by_time
     known = {"K": KnownPoint(np.array([101.25, 0, 1.0]), 0.004)}
     told = associate(found, rows("floor", [1.0]), known)
     assert len(told.touches) == 1 and told.points == [0.004] and told.left_out == {"shot of the floor": 1}
