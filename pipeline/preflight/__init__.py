@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -19,8 +19,7 @@ from pipeline.config import Machine, Site
 from pipeline.errors import DetectionError, LogError, PipelineError, UsageError
 from pipeline.preflight.files import file_findings
 from pipeline.preflight.finding import Finding, Level
-from pipeline.runs import RunFolder
-from pipeline.stages.job import Source, check_log_file, describe, named_files
+from pipeline.stages.job import Source, check_log_file, describe
 
 if TYPE_CHECKING:
     from pipeline.logs.reader import Frame, LogReader, Sample

@@ -155,7 +155,7 @@ STAGES = (
     Stage("track", 1, "poses and cutting edge", ("estimate",), (), ("poses", "cutting_edge"), _tracking),
     Stage(
         "survey",
-        4,
+        5,
         "as-built against design",
         ("estimate", "track"),
         ("design", "ground", "checks", "utilities"),
