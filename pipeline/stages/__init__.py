@@ -145,7 +145,7 @@ STAGES = (
     Stage("detect", 7, "finding markers", ("ingest",), ("log",), ("detections",), _seeing),
     Stage(
         "estimate",
-        18,
+        19,
         "adjusting the network",
         ("ingest", "detect"),
         (),
