@@ -20,7 +20,7 @@ from pipeline.surface.parked import KnownPoint
 from pipeline.surface.rests import Rests
 from pipeline.surface.shots import NO_TIME, Shots
 from pipeline.synthetic import files, recording
-from pipeline.synthetic.calibration_sites import calibration_bucket
+from pipeline.synthetic.touched_stake import calibration_bucket
 from pipeline.tracks.poses import States
 from tests.calibration.rigs import drawn
 
