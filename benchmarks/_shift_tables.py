@@ -253,12 +253,24 @@ def _checks(rng: np.random.Generator, stations: dict[str, np.ndarray], n: int = 
     return found
 
 
+BUDGET = (
+    "benchmarks",
+    "mounts",
+    "intrinsics",
+    "linkage and sensor",
+    "cutting edge",
+    "time offset",
+    "corners",
+)
+
+
 def _sides_and_volumes(stations: dict[str, np.ndarray]) -> dict[str, dict[str, np.ndarray]]:
-    """Two sides and three volumes of every station."""
+    """Two sides, three volumes and the sources of every station's common error."""
     found = {}
     for name, kind, words in (
         ("sides", "side", ("left", "right")),
         ("volumes", "kind", ("cut", "left to cut", "over-dug")),
+        ("station_budgets", "source", BUDGET),
     ):
         n = len(words) * len(stations["station"])
         columns = {key: np.full(n, 0.01).astype(v.dtype) for key, v in tables.empty_columns(name).items()}
