@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Collection, Iterator, Mapping
-from typing import Annotated
+from typing import Annotated, Self
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, WithJsonSchema, model_validator
@@ -61,13 +61,9 @@ def calibrated_in(section: Section, key: str = "") -> Iterator[tuple[str, Calibr
                     yield from calibrated_in(item, f"{key}.{name}.{inner}" if key else f"{name}.{inner}")
 
 
-class Pose(Section):
-    """A calibrated rigid pose ``T_parent_child`` with the covariance of its right perturbation."""
+class UncertainPose(Section):
+    """How well a pose is known: a covariance of its right perturbation, or two standard deviations."""
 
-    xyz_m: Triple
-    """Origin of the child in the parent, metres."""
-    rpy_deg: Triple
-    """Roll, pitch, yaw in degrees: ``R = Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
     sigma_mm: SigmaTriple | NonNegative | None = None
     """Standard deviation of the origin along the child's axes, millimetres; 0 means exact."""
     sigma_deg: SigmaTriple | NonNegative | None = None
@@ -77,7 +73,7 @@ class Pose(Section):
     calibrated: Calibrated | None = None
 
     @model_validator(mode="after")
-    def _one_uncertainty(self) -> Pose:
+    def _one_uncertainty(self) -> Self:
         sigmas = self.sigma_mm is not None and self.sigma_deg is not None
         if sigmas == (self.covariance is not None):
             raise ValueError(
@@ -86,10 +82,6 @@ class Pose(Section):
         if self.covariance is not None:
             check_covariance(self.covariance, 6)
         return self
-
-    def transform(self) -> np.ndarray:
-        """``T_parent_child``, (4, 4)."""
-        return se3.from_rotation_translation(so3.from_rpy_deg(np.array(self.rpy_deg)), np.array(self.xyz_m))
 
     def covariance_xi(self) -> np.ndarray:
         """(6, 6) covariance of ``xi = [rho, phi]``, m² and rad²."""
@@ -100,6 +92,19 @@ class Pose(Section):
             [np.broadcast_to(self.sigma_mm, 3) / 1000.0, np.deg2rad(np.broadcast_to(self.sigma_deg, 3))]
         )
         return np.diag(sigma**2)
+
+
+class Pose(UncertainPose):
+    """A calibrated rigid pose ``T_parent_child`` with the covariance of its right perturbation."""
+
+    xyz_m: Triple
+    """Origin of the child in the parent, metres."""
+    rpy_deg: Triple
+    """Roll, pitch, yaw in degrees: ``R = Rz(yaw) @ Ry(pitch) @ Rx(roll)``."""
+
+    def transform(self) -> np.ndarray:
+        """``T_parent_child``, (4, 4)."""
+        return se3.from_rotation_translation(so3.from_rpy_deg(np.array(self.rpy_deg)), np.array(self.xyz_m))
 
 
 def check_covariance(rows: tuple[tuple[float, ...], ...], size: int) -> None:

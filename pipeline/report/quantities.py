@@ -154,16 +154,8 @@ def sides_table(inputs: ReportInputs, units: Units, words: Words) -> dict[str, A
         row[f"u_{side}"] = units.to_deviation(k * np.hypot(table["sigma_own"][i], table["sigma_common"][i]))
         row[f"verdict_{side}"] = table["verdict"][i]
         row[f"slope_{side}"] = table["slope"][i]
-    both = {
-        key: table[key].reshape(-1, 2) for key in ("outward", "sigma_own", "sigma_common", "design_width")
-    }
-    width = both["design_width"][:, 0] + both["outward"].sum(axis=1)
-    # An error of the whole edge across moves both sides alike: in the width it is not.
-    sigma = np.hypot(
-        np.hypot(both["sigma_own"][:, 0], both["sigma_own"][:, 1]), np.diff(both["sigma_common"])[:, 0]
-    )
-    for i, row in enumerate(at.values()):
-        row["width"], row["u_width"] = units.to_length(width[i]), units.to_deviation(k * sigma[i])
+        row["width"] = units.to_length(table["width"][i])
+        row["u_width"] = units.to_deviation(k * table["sigma_width"][i])
     for row in at.values():
         if np.isfinite(row["left"]) or np.isfinite(row["right"]):
             rows.append(row)

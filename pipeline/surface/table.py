@@ -58,7 +58,8 @@ def columns_of_sides(sides: Sides, judged: SideVerdicts | None) -> Columns:
     return {
         "station": np.repeat(sides.station, 2),
         "side": np.tile(np.array(SIDES, object), len(sides.station)),
-        "design_width": np.repeat(sides.design_width, 2),
+        "width": np.repeat(sides.width, 2),
+        "sigma_width": np.repeat(np.hypot(sides.sigma_width_own, sides.sigma_width_common), 2),
         **{name: values.ravel() for name, values in (found | said).items()},
     }
 

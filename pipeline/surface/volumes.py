@@ -176,10 +176,7 @@ def volumes(
         (0.0, 0.0) if ground is None else _undug(built, design, ground, (s - half, s + half)) for s in station
     ]
     of_station = tuple(over_rows(slice(border[i], border[i + 1]), *outside[i]) for i in range(len(station)))
-    elsewhere = plan = 0.0
-    if ground is not None:
-        ends = (float(station[0] - 0.5 * step_m), float(station[-1] + 0.5 * step_m))
-        elsewhere, plan = _undug(built, design, ground, ends)
+    elsewhere, plan = (float(sum(part)) for part in zip(*outside))
     job = over_rows(slice(0, grid.rows), elsewhere, plan)
     floor = built.floor & np.isfinite(built.design_h)
     # Beyond the first and the last row that was cut there is no in between.

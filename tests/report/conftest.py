@@ -157,7 +157,8 @@ def sides_and_volumes(stations):
     sides = {
         "station": np.repeat(stations["station"], 2),
         "side": np.tile(np.array(["left", "right"], object), n),
-        "design_width": np.full(2 * n, 1.2),
+        "width": np.repeat(1.2 + outward.sum(axis=1), 2),
+        "sigma_width": np.where(known.all(axis=1), 0.0057, np.nan).repeat(2),
         "outward": outward.ravel(),
         "sigma_own": np.where(known, 0.004, np.nan).ravel(),
         "sigma_common": np.where(known, 0.003, np.nan).ravel(),

@@ -83,13 +83,13 @@ def test_where_no_shot_helps_the_page_says_why(open_, partly, said):
     assert ("digging does" in wanted["sentence"]) == (partly > 0)
 
 
-def test_the_width_is_the_designed_one_with_both_sides_and_shares_no_error_across(made):
+def test_the_width_of_the_floor_stands_beside_its_sides(made):
     unit, page = made
     units = units_of(unit, METRES[unit])
     row = page.content["sides"]["rows"][0]
     outward = float(np.sum([0.02 * np.sin(100.25), 0.015 * np.cos(100.25)]))
     assert row["width"] == pytest.approx((1.2 + outward) / METRES[unit], abs=1e-5)
-    assert row["u_width"] == pytest.approx(float(units.to_deviation(2 * 0.004 * np.sqrt(2))), rel=1e-3)
+    assert row["u_width"] == pytest.approx(float(units.to_deviation(2 * 0.0057)), rel=1e-3)
 
 
 def test_each_station_has_its_common_error_by_source_and_what_brings_nothing_is_left_out(made):
