@@ -7,41 +7,21 @@ from typing import Annotated
 from pydantic import Field, model_validator
 
 from pipeline.config.quantities import (
-    Calibrated,
-    NonNegative,
     Positive,
     Print,
     Section,
-    SigmaTriple,
     Triple,
-    check_covariance,
+    UncertainPose,
 )
 
 
-class SurveyedPose(Section):
+class SurveyedPose(UncertainPose):
     """A marker's pose in the grid."""
 
     enh: Triple
     """Easting, northing, elevation of the marker's centre, grid unit."""
     rpy_deg: Triple
     """``R_grid_marker = Rz(yaw) @ Ry(pitch) @ Rx(roll)``, degrees."""
-    sigma_mm: SigmaTriple | NonNegative | None = None
-    """Of the centre, along the marker's axes."""
-    sigma_deg: SigmaTriple | NonNegative | None = None
-    """Of the rotation, about the marker's axes."""
-    covariance: tuple[tuple[float, ...], ...] | None = None
-    """6x6 covariance of ``xi = [rho, phi]`` in m and rad instead of the two sigmas."""
-    calibrated: Calibrated | None = None
-
-    @model_validator(mode="after")
-    def _one_uncertainty(self) -> SurveyedPose:
-        if (self.sigma_mm is not None and self.sigma_deg is not None) == (self.covariance is not None):
-            raise ValueError(
-                "give either sigma_mm and sigma_deg, or covariance (6x6); a surveyed pose is not exact by default"
-            )
-        if self.covariance is not None:
-            check_covariance(self.covariance, 6)
-        return self
 
 
 class SurveyedCorner(Section):

@@ -11,20 +11,16 @@ from pipeline.calibration.cluster import CameraPair, Cluster, point_sigma_m
 from pipeline.report import palette
 from pipeline.report.drawing import new_figure
 from pipeline.report.numbers import column, number, table
-from pipeline.report.sheet import GOOD, POOR, Part, Picture, Sheet
+from pipeline.report.sheet import Demand, Part, Picture, Sheet
 from pipeline.report.words import Words
 
-SHARE = 1 / 3
-"""Of the tolerance that ``k sigma`` of the cluster may take: the survey, the arm and the pixels want theirs."""
 OFF = 3.0
 """Normalised difference of odd and even instants, root mean square of its components, from which it is remarked."""
 
 
 def cluster_sheet(
     cluster: Cluster,
-    tolerance_m: float,
-    coverage_factor: float,
-    distance_m: float,
+    demand: Demand,
     free_intrinsics: bool,
     subject: str,
     origin: Mapping[str, str],
@@ -36,12 +32,8 @@ def cluster_sheet(
     ----------
     cluster : Cluster
         As told.
-    tolerance_m : float
-        The smaller of the job's two, metres.
-    coverage_factor : float
-        k in U = k sigma.
-    distance_m : float
-        Of the cutting edge from the cameras.
+    demand : Demand
+        Of the job.
     free_intrinsics : bool
         Whether the lenses are written too.
     subject, origin
@@ -51,23 +43,15 @@ def cluster_sheet(
     """
     words = Words(language)
     tied = [pair for pair in cluster.pairs if cluster.reference in (pair.first, pair.second)]
-    sigmas_m = [point_sigma_m(_against_reference(cluster, pair), distance_m) for pair in tied]
+    sigmas_m = [point_sigma_m(_against_reference(cluster, pair), demand.distance_m) for pair in tied]
     sigma_m = max(sigmas_m)
     pair = tied[sigmas_m.index(sigma_m)]
-    limit_m = SHARE * tolerance_m / coverage_factor
-    good = sigma_m <= limit_m
-    sentence = words(
-        "cluster.good" if good else "cluster.poor",
-        mm=f"{1000 * sigma_m:.1f}",
-        distance=f"{distance_m:g}",
-        limit=f"{1000 * limit_m:.1f}",
-        tolerance=f"{1000 * tolerance_m:g}",
-    )
+    state, sentence = demand.judge(sigma_m, words, "cluster")
     numbers = [
         (
             words("cluster.edge"),
             number(1000 * sigma_m, "mm", 1),
-            words("cluster.edge_note", distance=f"{distance_m:g}"),
+            words("cluster.edge_note", distance=f"{demand.distance_m:g}"),
         ),
         (
             words("cluster.rotation"),
@@ -110,7 +94,7 @@ def cluster_sheet(
     return Sheet(
         title=words("cluster.title"),
         subject=subject,
-        state=GOOD if good else POOR,
+        state=state,
         sentence=sentence,
         numbers=numbers,
         remarks=_remarks(cluster, words),

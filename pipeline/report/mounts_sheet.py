@@ -13,18 +13,13 @@ from pipeline.geometry import se3, so3
 from pipeline.report import palette
 from pipeline.report.drawing import new_figure
 from pipeline.report.numbers import column, number, table
-from pipeline.report.sheet import GOOD, POOR, Part, Picture, Sheet
+from pipeline.report.sheet import Demand, Part, Picture, Sheet
 from pipeline.report.words import Words
-
-SHARE = 1 / 3
-"""Of the tolerance that ``k sigma`` of one told quantity may take."""
 
 
 def mounts_sheet(
     mounts: Mounts,
-    tolerance_m: float,
-    coverage_factor: float,
-    distance_m: float,
+    demand: Demand,
     subject: str,
     origin: Mapping[str, str],
     language: str = "en",
@@ -35,30 +30,19 @@ def mounts_sheet(
     ----------
     mounts : Mounts
         As told.
-    tolerance_m, coverage_factor : float
+    demand : Demand
         Of the job.
-    distance_m : float
-        Of the cutting edge from what is told.
     subject, origin
         As `Sheet` has them.
     language : str
         Of the words.
     """
     words = Words(language)
-    sigmas = {t.key: edge_sigma_m(t, distance_m) for t in mounts.told}
+    sigmas = {t.key: edge_sigma_m(t, demand.distance_m) for t in mounts.told}
     # A mount that the file did not have serves the calibration only.
     counted = [t.key for t in mounts.told if t.T_file is not None] or list(sigmas)
     worst = max(counted, key=lambda key: sigmas[key])
-    limit_m = SHARE * tolerance_m / coverage_factor
-    good = sigmas[worst] <= limit_m
-    sentence = words(
-        "mounts.good" if good else "mounts.poor",
-        what=worst,
-        mm=f"{1000 * sigmas[worst]:.1f}",
-        distance=f"{distance_m:g}",
-        limit=f"{1000 * limit_m:.1f}",
-        tolerance=f"{1000 * tolerance_m:g}",
-    )
+    state, sentence = demand.judge(sigmas[worst], words, "mounts", what=worst)
     axes = [t for t in mounts.told if t.axis is not None]
     parts = [
         Part(
@@ -79,7 +63,7 @@ def mounts_sheet(
     return Sheet(
         title=words("mounts.title"),
         subject=subject,
-        state=GOOD if good else POOR,
+        state=state,
         sentence=sentence,
         numbers=[
             (words("mounts.edge"), number(1000 * sigmas[worst], "mm", 1), worst),

@@ -23,6 +23,39 @@ GOOD, POOR, OPEN = "good", "poor", "open"
 """Whether it is good enough; `open` where that cannot be told."""
 
 
+SHARE = 1 / 3
+"""Of the tolerance that ``k sigma`` of one calibration may take: the survey, the arm and the pixels want theirs."""
+
+
+@dataclass(frozen=True)
+class Demand:
+    """What a job asks of a calibration."""
+
+    tolerance_m: float
+    """The smaller of the job's two, metres."""
+    coverage_factor: float
+    """k in U = k sigma."""
+    distance_m: float
+    """Of the cutting edge from what is calibrated."""
+
+    def judge(self, sigma_m: float, words: Words, key: str, **places: str) -> tuple[str, str]:
+        """Whether a sigma at the cutting edge is good enough, and the sentence that says so.
+
+        The sentence stands under ``<key>.good`` or ``<key>.poor`` and may name mm, distance, limit and tolerance.
+        """
+        limit_m = SHARE * self.tolerance_m / self.coverage_factor
+        state = GOOD if sigma_m <= limit_m else POOR
+        said = words(
+            f"{key}.{state}",
+            mm=f"{1000 * sigma_m:.1f}",
+            distance=f"{self.distance_m:g}",
+            limit=f"{1000 * limit_m:.1f}",
+            tolerance=f"{1000 * self.tolerance_m:g}",
+            **places,
+        )
+        return state, said
+
+
 @dataclass(frozen=True)
 class Picture:
     """A figure of a sheet."""

@@ -8,11 +8,9 @@ import numpy as np
 
 from pipeline.calibration.corner_survey import MarkerPose, SurveyedMarker, datum_sigma_m
 from pipeline.report.numbers import column, number, table
-from pipeline.report.sheet import GOOD, POOR, Part, Sheet
+from pipeline.report.sheet import Demand, Part, Sheet
 from pipeline.report.words import Words
 
-SHARE = 1 / 3
-"""Of the tolerance that ``k sigma`` of the markers together may take."""
 ODD_SIZE = 3.0
 """Sigmas of a print's size in the survey against the file's from which it is remarked."""
 
@@ -20,9 +18,7 @@ ODD_SIZE = 3.0
 def survey_sheet(
     poses: Sequence[MarkerPose],
     markers: Sequence[SurveyedMarker],
-    tolerance_m: float,
-    coverage_factor: float,
-    distance_m: float,
+    demand: Demand,
     subject: str,
     origin: Mapping[str, str],
     language: str = "en",
@@ -33,31 +29,21 @@ def survey_sheet(
     ----------
     poses, markers
         What was told, and from what; in the same order.
-    tolerance_m, coverage_factor : float
+    demand : Demand
         Of the job.
-    distance_m : float
-        From the markers to the work.
     subject, origin
         As `Sheet` has them.
     language : str
         Of the words.
     """
     words = Words(language)
-    sigma_m = datum_sigma_m(poses, distance_m)
-    limit_m = SHARE * tolerance_m / coverage_factor
-    good = sigma_m <= limit_m
+    sigma_m = datum_sigma_m(poses, demand.distance_m)
     chi_square, redundancy = (sum(getattr(p, key) for p in poses) for key in ("chi_square", "redundancy"))
-    sentence = words(
-        "marker_survey.good" if good else "marker_survey.poor",
-        mm=f"{1000 * sigma_m:.1f}",
-        distance=f"{distance_m:g}",
-        limit=f"{1000 * limit_m:.1f}",
-        tolerance=f"{1000 * tolerance_m:g}",
-    )
+    state, sentence = demand.judge(sigma_m, words, "marker_survey")
     return Sheet(
         title=words("marker_survey.title"),
         subject=subject,
-        state=GOOD if good else POOR,
+        state=state,
         sentence=sentence,
         numbers=[
             (words("marker_survey.edge"), number(1000 * sigma_m, "mm", 1), words("marker_survey.edge_note")),

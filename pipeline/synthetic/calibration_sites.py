@@ -196,27 +196,18 @@ class CalibrationRenderer(Renderer):
             self.boards[BUCKET_BOARD.name] = board(BUCKET_BOARD, site.spec.family)
             self.textures[BUCKET_BOARD.name] = board_texture(self.boards[BUCKET_BOARD.name], rng)
 
-    def _scene(self, camera: str, poses: dict[str, np.ndarray], k: int, t: float) -> np.ndarray:
-        T_world_camera = poses["cab"][k] @ self.mounts.cameras[camera]
-        T_camera_world = se3.inverse(T_world_camera)
-        size = (self.spec.width, self.spec.height)
-        view = View(T_camera_world, self.mounts.intrinsics[camera], size, self.dirt)
-        canvas = self._background(camera, T_world_camera)
-        self._posts(view, canvas)
-        scene = canvas.astype(np.float32)
-        for plan in self.spec.benchmarks:
-            name = plan.board.name
-            self._paste(camera, scene, name, T_camera_world @ self.mounts.benchmarks[name], t)
-        if self.site.bucket_marker is not None:
-            self._arm(view, scene, poses, k)
-            T_camera_stick = T_camera_world @ poses["stick"][k]
-            self._bracket(view, scene, poses["stick"][k])
-            self._paste(
-                camera, scene, self.spec.stick_board.name, T_camera_stick @ self.mounts.stick_marker, t
-            )
-            T_camera_bucket = T_camera_world @ poses["bucket"][k]
-            self._paste(camera, scene, BUCKET_BOARD.name, T_camera_bucket @ self.site.bucket_marker, t)
-        return scene
+    def _earthworks(self, view: View, canvas: np.ndarray, t: float) -> None:
+        """Nothing is dug in the yard."""
+
+    def _machine(
+        self, camera: str, view: View, scene: np.ndarray, poses: dict[str, np.ndarray], k: int, t: float
+    ) -> None:
+        """The arm is out of sight but where its axes are told; then the bucket carries a board."""
+        if self.site.bucket_marker is None:
+            return
+        super()._machine(camera, view, scene, poses, k, t)
+        T_camera_bucket = view.T_camera_world @ poses["bucket"][k]
+        self._paste(camera, scene, BUCKET_BOARD.name, T_camera_bucket @ self.site.bucket_marker, t)
 
 
 __all__ = ["BUCKET_BOARD", "CLUSTER", "MOUNTS", "NAMES", "CalibrationRenderer", "calibration_site"]

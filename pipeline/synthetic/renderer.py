@@ -137,18 +137,27 @@ class Renderer:
         size = (self.spec.width, self.spec.height)
         view = View(T_camera_world, self.mounts.intrinsics[camera], size, self.dirt)
         canvas = self._background(camera, T_world_camera)
-        self._trench(view, canvas, t)
+        self._earthworks(view, canvas, t)
         self._posts(view, canvas)
         scene = canvas.astype(np.float32)
         for plan in self.spec.benchmarks:
             name = plan.board.name
             self._paste(camera, scene, name, T_camera_world @ self.mounts.benchmarks[name], t)
-        self._arm(view, scene, poses, k)
-        stick_board = self.spec.stick_board.name
-        T_camera_marker = T_camera_world @ poses["stick"][k] @ self.mounts.stick_marker
-        self._bracket(view, scene, poses["stick"][k])
-        self._paste(camera, scene, stick_board, T_camera_marker, t)
+        self._machine(camera, view, scene, poses, k, t)
         return scene
+
+    def _earthworks(self, view: View, canvas: np.ndarray, t: float) -> None:
+        """What was dug so far."""
+        self._trench(view, canvas, t)
+
+    def _machine(
+        self, camera: str, view: View, scene: np.ndarray, poses: dict[str, np.ndarray], k: int, t: float
+    ) -> None:
+        """The arm and what hangs on it."""
+        self._arm(view, scene, poses, k)
+        self._bracket(view, scene, poses["stick"][k])
+        T_camera_marker = view.T_camera_world @ poses["stick"][k] @ self.mounts.stick_marker
+        self._paste(camera, scene, self.spec.stick_board.name, T_camera_marker, t)
 
     def _background(self, camera: str, T_world_camera: np.ndarray) -> np.ndarray:
         spec = self.spec
