@@ -20,6 +20,7 @@ import numpy as np
 from pipeline.calibration import curve_fit
 from pipeline.calibration.agreement import agreed, kept_of
 from pipeline.calibration.curve_fit import azimuth_of
+from pipeline.calibration.standings import RULE, Touched, machine_to_the_pin, standings, touched
 from pipeline.calibration.touches import Adjusted
 from pipeline.config import Machine, Site, load_machine, load_site
 from pipeline.estimation import adjust
@@ -29,12 +30,11 @@ from pipeline.geometry import camera as camera_model
 from pipeline.geometry import linkage, se3
 from pipeline.network import Network, Observations, network_of
 from pipeline.stages.bucket_files import rig_of
-from pipeline.stages.touched import RULE, Touched, machine_to_the_pin, standings, touched
 from pipeline.surface.rests import rests_of
 from pipeline.surface.shots import Shots
 from pipeline.synthetic import files, recording
-from pipeline.synthetic.calibration_sites import calibration_bucket
 from pipeline.synthetic.recording import World
+from pipeline.synthetic.touched_stake import calibration_bucket
 from pipeline.synthetic.touching import Touching
 from pipeline.tracks.poses import cutting_edge
 from pipeline.tracks.table import states_from_columns

@@ -49,11 +49,6 @@ class CalibrationBoard:
         return ":".join([*parts, *([str(self.first_id)] if self.first_id else [])])
 
     @property
-    def corners_each(self) -> int:
-        """Corners that are found together: four of a tag in a grid, else one."""
-        return 4 if self.kind == APRILTAG else 1
-
-    @property
     def corners_m(self) -> np.ndarray:
         """(n, 3) metres; row by row from the top left, tag by tag in a grid (top-left, top-right, bottom-right,
         bottom-left of each).

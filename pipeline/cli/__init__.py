@@ -5,7 +5,6 @@ Imports of weight stand inside the commands, so that ``gradetrace --help`` answe
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from pipeline import __version__
-from pipeline.cli import calibrate_network  # noqa: F401  its commands join `calibrate`
 from pipeline.cli.calibrate import calibrate
 from pipeline.cli.noise import noise
+from pipeline.cli.options import JOBS, LOG, MACHINE, RUNS, SITE, print_table, usable_cores
 from pipeline.cli.plan import plan
 from pipeline.cli.survey import survey
 from pipeline.errors import EXIT_BAD_INPUT, EXIT_OK, EXIT_PARTIAL_LOG, EXIT_VERDICT_FAIL, PipelineError
@@ -41,29 +40,6 @@ class FrontDoor(click.Group):
             sys.exit(EXIT_INTERRUPTED)
 
 
-LOG = click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
-MACHINE = click.option(
-    "--machine",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="machine.toml to use; else the one beside the log, else the log's attachment.",
-)
-SITE = click.option(
-    "--site",
-    metavar="FILE",
-    type=click.Path(path_type=Path),
-    help="site.toml to use; else the one beside the log, else the log's attachment.",
-)
-RUNS = click.option(
-    "--runs",
-    metavar="DIR",
-    type=click.Path(path_type=Path, file_okay=False),
-    default=Path("runs"),
-    show_default=True,
-    help="Where results go; each log has a folder of its own there.",
-)
-
-
 @click.group(cls=FrontDoor, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="gradetrace")
 def main() -> None:
@@ -84,9 +60,7 @@ main.add_command(survey)
 @click.option(
     "--strict", is_flag=True, help="End with 4 if the verdict is FAIL, 5 if part of the log is lost."
 )
-@click.option(
-    "--jobs", metavar="N", type=click.IntRange(1, 512), help="Processes to use; by default all cores."
-)
+@JOBS
 def report(
     log: Path, machine: Path | None, site: Path | None, runs: Path, strict: bool, jobs: int | None
 ) -> None:
@@ -146,7 +120,7 @@ def status(log: Path, machine: Path | None, site: Path | None, runs: Path) -> No
         counts = ", ".join(count_words(state.manifest.counts)) if state.manifest else ""
         seconds = f"{state.manifest.seconds:.1f}" if state.manifest else ""
         rows.append((state.stage.name, word, seconds, state.why or counts))
-    _print_table(("stage", "state", "seconds", ""), rows)
+    print_table(("stage", "state", "seconds", ""), rows)
     click.echo(f"run folder: {job.folder.path}")
 
 
@@ -197,7 +171,7 @@ def diff(a: Path, b: Path, as_json: bool) -> None:
     for name, report in (("A", found.a), ("B", found.b)):
         log = report.files.get("log", ("unknown", ""))[0]
         click.echo(f"{name}: {report.source}, log {log}, verdict {report.verdict}")
-    _print_table(*table_of(found))
+    print_table(*table_of(found))
     for line in sentences(found):
         click.echo(line)
 
@@ -242,14 +216,6 @@ def sample_logs(arguments: tuple[str, ...]) -> None:
     render(list(arguments))
 
 
-def usable_cores() -> int:
-    """Cores this process may use; a container or `taskset` may leave it fewer than the machine has."""
-    try:
-        return len(os.sched_getaffinity(0))
-    except AttributeError:
-        return os.cpu_count() or 1
-
-
 def _say_sources(job: Job) -> None:
     for source in (job.machine_source, job.site_source):
         where = {
@@ -267,13 +233,6 @@ def _outcome(job: Job) -> tuple[str, bool]:
     verdict = str(job.counts("report").get("verdict", "unknown"))
     recovery = json.loads(job.folder.file("log.json").read_text(encoding="utf-8")).get("recovery", {})
     return verdict, bool(recovery.get("complete", True))
-
-
-def _print_table(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> None:
-    widths = [max(len(row[column]) for row in [head, *rows]) for column in range(len(head) - 1)]
-    for row in [head, *rows]:
-        cells = [cell.ljust(width) for cell, width in zip(row, widths, strict=False)]
-        click.echo("  ".join([*cells, row[-1]]).rstrip())
 
 
 def _plural(number: int, noun: str) -> str:

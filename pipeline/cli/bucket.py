@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
+from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, usable_cores
+
 
 @click.command()
-@click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
+@LOG
 @click.argument("checks", metavar="[CHECKS]", required=False, type=click.Path(path_type=Path, exists=True))
-@click.option("--machine", metavar="FILE", type=click.Path(path_type=Path), help="machine.toml to change.")
-@click.option(
-    "--site", metavar="FILE", type=click.Path(path_type=Path), help="site.toml with the benchmarks."
-)
+@WRITTEN_MACHINE
+@SITE
 @click.option("--point", metavar="E,N,H|ID", help="The point that was touched, grid unit, or its id.")
 @click.option(
     "--tooth",
@@ -26,11 +26,8 @@ import click
               help="How well a tooth sits on the mark, standard deviation.")  # fmt: skip
 @click.option("--sensor", metavar="NAME", help="Which sensor, where several read the bucket's joint.")
 @click.option("--wear", is_flag=True, help="Hold curve and mount, and tell how much the teeth are worn.")
-@click.option("--runs", metavar="DIR", type=click.Path(path_type=Path, file_okay=False), default=Path("runs"),
-              show_default=True, help="Where results go.")  # fmt: skip
-@click.option(
-    "--jobs", metavar="N", type=click.IntRange(1, 512), help="Processes to use; by default all cores."
-)
+@RUNS
+@JOBS
 def bucket(
     log: Path,
     checks: Path | None,
@@ -49,13 +46,12 @@ def bucket(
     LOG was recorded while the edge stood on the point, two seconds each time; CHECKS has the point's coordinates
     and when it was touched, or shots of the parked edge.
     """
-    import os
-
     from pipeline.progress import watch_on
     from pipeline.stages.calibrate_bucket import Wanted, calibrate_bucket
 
-    workers = jobs or (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1)
-    wanted = Wanted(log, checks, machine, site, runs, point, tooth, sensor, contact_mm, wear, workers)
+    wanted = Wanted(
+        log, checks, machine, site, runs, point, tooth, sensor, contact_mm, wear, jobs or usable_cores()
+    )
     done = calibrate_bucket(wanted, watch_on())
     click.echo(done.sentence)
     click.echo(f"written: {done.machine_file} (before: {done.kept.name}) · sheet {done.sheet}")

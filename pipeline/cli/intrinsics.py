@@ -8,6 +8,8 @@ from pathlib import Path
 
 import click
 
+from pipeline.cli.options import FILE, distance
+
 
 @click.command()
 @click.argument("source", metavar="LOG|FOLDER", type=click.Path(path_type=Path))
@@ -25,7 +27,7 @@ import click
 @click.option(
     "--machine",
     metavar="FILE",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     help="machine.toml to write the intrinsics into; the old file is kept beside it.",
 )
 @click.option(
@@ -35,21 +37,14 @@ import click
     show_default=True,
     help="Model of the lens; machine.toml holds brown5.",
 )
-@click.option(
-    "--distance",
-    metavar="M",
-    type=click.FloatRange(0.1, 1000),
-    default=10.0,
-    show_default=True,
-    help="Working distance at which millimetres are told.",
-)
+@distance(10.0, "Working distance at which millimetres are told.")
 @click.option(
     "--size", metavar="WxH", default="", help="Size of the pictures, px; only of a corner file (vnl)."
 )
 @click.option(
     "--out",
     metavar="FILE",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     help="The sheet; else intrinsics-NAME.html.",
 )
 def intrinsics(
@@ -59,7 +54,7 @@ def intrinsics(
     topic: str,
     machine: Path | None,
     model: str,
-    distance: float,
+    distance_m: float,
     size: str,
     out: Path | None,
 ) -> None:
@@ -79,7 +74,7 @@ def intrinsics(
         topic,
         machine,
         model,
-        distance,
+        distance_m,
         (int(wanted[1]), int(wanted[2])) if wanted else None,
         out,
         _tell if sys.stderr.isatty() else lambda pictures: None,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.cli.calibrate_network import DISTANCE, FILE, say
+from pipeline.cli.options import FILE, distance, say_written
 from pipeline.errors import UsageError
 
 
@@ -24,7 +24,7 @@ from pipeline.errors import UsageError
 @click.option("--station", metavar="E,N,H", help="The instrument's place, grid unit: prints must face it.")
 @click.option("--date", metavar="DAY", type=click.DateTime(["%Y-%m-%d"]),
               help="Of the survey; else the day FILE was last changed.")  # fmt: skip
-@DISTANCE
+@distance(8.0, "From the markers to the cutting edge, for the line that says whether it is good enough.")
 def survey(
     file: Path,
     site: Path,
@@ -52,7 +52,7 @@ def survey(
         None if date is None else date.date(),
         distance_m,
     )
-    say(written)
+    say_written(written)
 
 
 def _layout(text: str | None) -> dict[str, str]:

@@ -9,24 +9,24 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.calibration.agreement import agreed, kept_of
+from pipeline.calibration.standings import RULE, Touched, machine_to_the_pin, standings, touched
 from pipeline.calibration.touches import TOOL
 from pipeline.config import Machine, Site
-from pipeline.errors import CalibrationError, ConfigError
+from pipeline.errors import CalibrationError
 from pipeline.estimation.table import sensitivities_from_columns
 from pipeline.report.bucket_sheet import BucketFacts, bucket_sheet
+from pipeline.report.sheet import SHARE
 from pipeline.runs import RunFolder
 from pipeline.stages import stage_named
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
 from pipeline.stages.calibrated import put_into, put_sheet
-from pipeline.stages.job import Job, check_log_file, describe
-from pipeline.stages.runner import Watch, plan, run_stage
-from pipeline.stages.touched import RULE, Touched, machine_to_the_pin, standings, touched
+from pipeline.stages.calibration_log import machine_to_write
+from pipeline.stages.job import Job, open_log
+from pipeline.stages.runner import Watch, run_if_stale
 from pipeline.surface.rests import rests_of
 from pipeline.tracks.table import cutting_edge_from_columns, states_from_columns
 
 STAGES = ("ingest", "detect", "estimate", "track")
-SHARE_OF_TOLERANCE = 1 / 3
-"""Of the job's tolerance that the bucket may use up, at k = 2."""
 
 
 @dataclass(frozen=True)
@@ -69,41 +69,17 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Calibrated:
     PipelineError
         The log, a description or a stage is at fault.
     """
-    check_log_file(wanted.log)
-    machine, machine_source, site, site_source = describe(wanted.log, wanted.machine, wanted.site)
-    if machine_source.origin == "attachment":
-        raise ConfigError(
-            f"{wanted.log} has only the machine.toml inside it, and nothing can be written there; put one beside the "
-            "log, or name it with --machine"
-        )
-    machine_file = wanted.machine or wanted.log.parent / "machine.toml"
-    name = sensor_of(machine, wanted.sensor)
-    reduced, joint = machine_to_the_pin(machine)
     # Of its own: in runs/<log> the tables are those of the whole machine.
     folder = RunFolder(wanted.runs / f"{wanted.log.stem}-bucket")
-    folder.create()
-    job = Job(
-        log=wanted.log,
-        log_sha256=folder.hash_file(wanted.log),
-        folder=folder,
-        machine=machine,
-        site=site,
-        machine_source=machine_source,
-        site_source=site_source,
-        files={},
-        workers=wanted.workers,
-    )
+    job = open_log(wanted.log, wanted.machine, wanted.site, folder, wanted.workers, create_folder=True)
+    machine, site = job.machine, job.site
+    machine_file = machine_to_write(job, wanted.machine)
+    name = sensor_of(machine, wanted.sensor)
+    reduced, joint = machine_to_the_pin(machine)
+    to_the_pin = replace(job, machine=reduced)
     with folder.locked():
-        for stage_name in STAGES:
-            stage = stage_named(stage_name)
-            here = job if stage_name == "ingest" else replace(job, machine=reduced)
-            now = plan(here, stage)
-            why = folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
-            if why is not None:
-                run_stage(here, stage, now, watch, why)
-            manifest = folder.manifest(stage.name)
-            assert manifest is not None
-            watch.done(stage, manifest, ran=why is not None)
+        for stage in STAGES:
+            run_if_stale(job if stage == "ingest" else to_the_pin, stage_named(stage), watch)
         found = _touched(job, wanted, machine, site, name)
         reader = job.at(stage_named("report"), "")
         start_ns = int(reader.read_json("log.json")["start_ns"])
@@ -121,12 +97,12 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Calibrated:
             point_names=tuple(found.point_names),
             left_out=found.left_out,
             wear_m=None if kept else float(worn_m(machine, date) - adjusted.value[TOOL][2]),
-            tolerance_m=min(site.tolerance.high_mm, site.tolerance.low_mm) / 1000 * SHARE_OF_TOLERANCE,
+            tolerance_m=min(site.tolerance.high_mm, site.tolerance.low_mm) / 1000 * SHARE,
             date=date,
             log=wanted.log.name,
             log_sha256=job.log_sha256,
             checks=None if wanted.checks is None else wanted.checks.name,
-            machine_sha256=machine_source.sha256,
+            machine_sha256=job.machine_source.sha256,
         )
         values = wear_values(machine, facts) if kept is None else values_of(machine, joint, name, kept, facts)
         sheet, page = folder.file("bucket.html"), bucket_sheet(facts)

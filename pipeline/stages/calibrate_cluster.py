@@ -3,38 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from pipeline.calibration.cluster import (
     Cluster,
     calibrate_cluster,
     default_reference,
 )
-from pipeline.geometry import so3
 from pipeline.report.cluster_sheet import cluster_sheet
-from pipeline.stages.calibrated import provenance, put_into, put_sheet
+from pipeline.stages.calibrated import (
+    Written,
+    demand_of,
+    lens_table,
+    pose_table,
+    provenance,
+    put_into,
+    put_sheet,
+    written_covariance,
+)
 from pipeline.stages.calibration_log import CalibrationLog, searched
 from pipeline.stages.runner import Watch
 
 COMMAND = "calibrate cluster"
-
-
-@dataclass(frozen=True)
-class Written:
-    """What a calibration left."""
-
-    sentence: str
-    """Whether it is good enough, in one line."""
-    remarks: tuple[str, ...]
-    sheet: Path
-    file: Path
-    """With the new values."""
-    kept: Path
-    """The file as it was."""
 
 
 def run(
@@ -60,28 +51,16 @@ def run(
         cluster = calibrate_cluster(found.machine, found.site, reference, found.detections)
         sheet = cluster_sheet(
             cluster,
-            tolerance_m=min(found.site.tolerance.high_mm, found.site.tolerance.low_mm) / 1000,
-            coverage_factor=found.site.tolerance.coverage_factor,
-            distance_m=distance_m,
+            demand_of(found.site, distance_m),
             free_intrinsics=free_intrinsics,
             subject=found.machine.machine.id,
-            origin=origin_of(found),
+            origin=found.origin,
         )
         values = values_of(cluster, found, free_intrinsics)
         page = found.folder / "calibration-cluster.html"
         put_sheet(sheet, page)
         kept = put_into(found.machine_file, "machine", values)
     return Written(sheet.sentence, tuple(sheet.remarks), page, found.machine_file, kept)
-
-
-def origin_of(found: CalibrationLog) -> dict[str, str]:
-    """What a sheet says of its origin: names, hashes and the day of the recording."""
-    job = found.job
-    return {
-        "log": f"{job.log.name}, sha256 {job.log_sha256[:12]}",
-        "recorded": found.date.isoformat(),
-        **{s.name: f"sha256 {s.sha256[:12]}" for s in (job.machine_source, job.site_source)},
-    }
 
 
 def values_of(cluster: Cluster, found: CalibrationLog, free_intrinsics: bool) -> Mapping[str, Any]:
@@ -97,29 +76,8 @@ def values_of(cluster: Cluster, found: CalibrationLog, free_intrinsics: bool) ->
         for name, (lens, covariance) in cluster.intrinsics.items():
             camera = found.machine.cameras[name]
             assert camera.intrinsics is not None
-            values[f"cameras.{name}.intrinsics"] = {
-                "width": camera.intrinsics.width,
-                "height": camera.intrinsics.height,
-                **dict(zip(("fx", "fy", "cx", "cy"), lens[:4].tolist(), strict=True)),
-                "distortion": lens[4:],
-                "covariance": written_covariance(covariance),
-                "calibrated": stamp,
-            }
+            size = camera.intrinsics.width, camera.intrinsics.height
+            values[f"cameras.{name}.intrinsics"] = lens_table(
+                size, lens, written_covariance(covariance), stamp
+            )
     return values
-
-
-def pose_table(T: np.ndarray, covariance: np.ndarray | None, stamp: Mapping[str, Any]) -> dict[str, Any]:
-    """A pose as machine.toml has it; without covariance it is exact: it says where its parent begins."""
-    table: dict[str, Any] = {"xyz_m": T[:3, 3], "rpy_deg": so3.to_rpy_deg(T[:3, :3])}
-    if covariance is None:
-        table |= {"sigma_mm": 0.0, "sigma_deg": 0.0}
-    else:
-        table["covariance"] = written_covariance(covariance)
-    return {**table, "calibrated": dict(stamp)}
-
-
-def written_covariance(covariance: np.ndarray) -> np.ndarray:
-    """A covariance as it goes into a file: symmetric, without what is only rounding."""
-    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
-    even = 0.5 * (covariance + covariance.T)
-    return np.where(np.abs(even) > 1e-9 * np.outer(sigma, sigma), even, 0.0)

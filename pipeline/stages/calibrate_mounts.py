@@ -8,8 +8,7 @@ from typing import Any
 
 from pipeline.calibration.mounts import calibrate_mounts
 from pipeline.report.mounts_sheet import mounts_sheet
-from pipeline.stages.calibrate_cluster import Written, origin_of, pose_table
-from pipeline.stages.calibrated import provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, demand_of, pose_table, provenance, put_into, put_sheet
 from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 
@@ -29,14 +28,11 @@ def run(
     """Calibrate what is freed and write it. Raises PipelineError; nothing is written then."""
     with searched(log, machine, site, runs, workers, watch) as found:
         mounts = calibrate_mounts(found.machine, found.site, free, found.detections)
-        tolerance = found.site.tolerance
         sheet = mounts_sheet(
             mounts,
-            tolerance_m=min(tolerance.high_mm, tolerance.low_mm) / 1000,
-            coverage_factor=tolerance.coverage_factor,
-            distance_m=distance_m,
+            demand_of(found.site, distance_m),
             subject=found.machine.machine.id,
-            origin=origin_of(found),
+            origin=found.origin,
         )
         stamp = provenance(found.date, COMMAND, found.job.log, found.job.log_sha256)
         values: dict[str, Any] = {t.key: pose_table(t.T, t.covariance, stamp) for t in mounts.told}

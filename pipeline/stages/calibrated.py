@@ -7,18 +7,41 @@ replaced, and the sheet comes first, so that no value stands in a file without t
 from __future__ import annotations
 
 import datetime
-import hashlib
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import load_machine, load_site
+import numpy as np
+
+from pipeline.config import Site, load_machine, load_site
 from pipeline.config.document import decode, read_file
 from pipeline.config.rewriting import with_values
-from pipeline.report.sheet import Sheet, render_sheet
-from pipeline.runs import atomic_write, json_bytes
+from pipeline.geometry import so3
+from pipeline.report.sheet import Demand, Sheet, render_sheet
+from pipeline.runs import atomic_write, json_bytes, sha256_of_file
 
 LOADERS: dict[str, Callable[[str, str], Any]] = {"machine": load_machine, "site": load_site}
+
+
+@dataclass(frozen=True)
+class Written:
+    """What a calibration left."""
+
+    sentence: str
+    """Whether it is good enough, in one line."""
+    remarks: tuple[str, ...]
+    sheet: Path
+    file: Path
+    """With the new values."""
+    kept: Path
+    """The file as it was."""
+
+
+def demand_of(site: Site, distance_m: float) -> Demand:
+    """What a job asks of a calibration whose part of the machine is so far from the cutting edge."""
+    tolerance = site.tolerance
+    return Demand(min(tolerance.high_mm, tolerance.low_mm) / 1000, tolerance.coverage_factor, distance_m)
 
 
 def provenance(
@@ -26,9 +49,40 @@ def provenance(
 ) -> dict[str, Any]:
     """A `calibrated` table (`config.quantities.Calibrated`): what told the value, and when it was recorded."""
     if source is not None and not sha256:
-        sha256 = hashlib.sha256(source.read_bytes()).hexdigest() if source.is_file() else ""
+        sha256 = sha256_of_file(source) if source.is_file() else ""
     named = "" if source is None else source.name
     return {"date": date, "by": by, "source": named, "sha256": sha256, **more}
+
+
+def pose_table(T: np.ndarray, covariance: np.ndarray | None, stamp: Mapping[str, Any]) -> dict[str, Any]:
+    """A pose as machine.toml has it; without covariance it is exact: it says where its parent begins."""
+    table: dict[str, Any] = {"xyz_m": T[:3, 3], "rpy_deg": so3.to_rpy_deg(T[:3, :3])}
+    if covariance is None:
+        table |= {"sigma_mm": 0.0, "sigma_deg": 0.0}
+    else:
+        table["covariance"] = written_covariance(covariance)
+    return {**table, "calibrated": dict(stamp)}
+
+
+def written_covariance(covariance: np.ndarray) -> np.ndarray:
+    """A covariance as it goes into a file: symmetric, without what is only rounding."""
+    sigma = np.sqrt(np.maximum(np.diagonal(covariance), 0.0))
+    even = 0.5 * (covariance + covariance.T)
+    return np.where(np.abs(even) > 1e-9 * np.outer(sigma, sigma), even, 0.0)
+
+
+def lens_table(
+    size: tuple[int, int], intrinsics: np.ndarray, covariance: np.ndarray, stamp: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Intrinsics (9,) with their covariance as machine.toml has them."""
+    return {
+        "width": size[0],
+        "height": size[1],
+        **dict(zip(("fx", "fy", "cx", "cy"), intrinsics[:4].tolist(), strict=True)),
+        "distortion": intrinsics[4:],
+        "covariance": covariance,
+        "calibrated": stamp,
+    }
 
 
 def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:

@@ -14,10 +14,8 @@ from pipeline.config import Machine, Site
 from pipeline.errors import ConfigError
 from pipeline.runs import RunFolder
 from pipeline.stages import stage_named
-from pipeline.stages.job import Job, check_log_file, describe
-from pipeline.stages.runner import Watch, plan, run_stage
-
-STAGES = ("ingest", "detect")
+from pipeline.stages.job import Job, open_log
+from pipeline.stages.runner import Watch, run_stale
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,18 +28,34 @@ class CalibrationLog:
     site: Site
     machine_file: Path
     """Into which what is told goes."""
-    site_file: Path | None
-    """None where the site came as an attachment."""
     detections: dict[str, dict[str, np.ndarray]]
     """By camera: columns of the table `detections`."""
-    sensors: dict[str, np.ndarray]
-    """Columns of the table `sensors`."""
     date: date
     """Day of the recording."""
 
     @property
     def folder(self) -> Path:
         return self.job.folder.path
+
+    @property
+    def origin(self) -> dict[str, str]:
+        """What a sheet says of where it comes from: names, hashes and the day of the recording."""
+        job = self.job
+        return {
+            "log": f"{job.log.name}, sha256 {job.log_sha256[:12]}",
+            "recorded": self.date.isoformat(),
+            **{s.name: f"sha256 {s.sha256[:12]}" for s in (job.machine_source, job.site_source)},
+        }
+
+
+def machine_to_write(job: Job, given: Path | None) -> Path:
+    """The machine.toml that values go into. Raises ConfigError where there is only the one inside the log."""
+    if job.machine_source.origin == "attachment":
+        raise ConfigError(
+            f"{job.log} has only the machine.toml inside it, and nothing can be written there; put one beside the log, "
+            "or name it with --machine"
+        )
+    return given or job.log.parent / "machine.toml"
 
 
 @contextmanager
@@ -55,46 +69,18 @@ def searched(
     PipelineError
         The log, a description or the folder is at fault.
     """
-    check_log_file(log)
-    model, machine_source, site_model, site_source = describe(log, machine, site)
-    if machine_source.origin == "attachment":
-        raise ConfigError(
-            f"{log} has only the machine.toml inside it, and nothing can be written there; put one beside the log, or "
-            "name it with --machine"
-        )
-    folder = RunFolder(runs / log.stem)
-    folder.create()
-    job = Job(
-        log=log,
-        log_sha256=folder.hash_file(log),
-        folder=folder,
-        machine=model,
-        site=site_model,
-        machine_source=machine_source,
-        site_source=site_source,
-        files={},
-        workers=workers,
-    )
-    with folder.locked():
-        for name in STAGES:
-            stage = stage_named(name)
-            now = plan(job, stage)
-            why = folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
-            if why is not None:
-                run_stage(job, stage, now, watch, why)
-            manifest = folder.manifest(stage.name)
-            assert manifest is not None
-            watch.done(stage, manifest, ran=why is not None)
+    job = open_log(log, machine, site, RunFolder(runs / log.stem), workers, create_folder=True)
+    machine_file = machine_to_write(job, machine)
+    with job.folder.locked():
+        run_stale(job, watch, last="detect")
         reader = job.at(stage_named("estimate"), "")
         yield CalibrationLog(
             job=job,
             machine=job.calibrated_machine(),
-            site=site_model,
-            machine_file=machine or log.parent / "machine.toml",
-            site_file=None if site_source.origin == "attachment" else (site or log.parent / "site.toml"),
+            site=job.site,
+            machine_file=machine_file,
             detections={
                 name: reader.read_table("detections", part=name) for name in reader.parts("detections")
             },
-            sensors=reader.read_table("sensors"),
             date=datetime.fromtimestamp(job.read_json("log.json")["start_ns"] / 1e9, UTC).date(),
         )

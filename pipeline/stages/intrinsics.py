@@ -23,7 +23,8 @@ from pipeline.geometry.lenses import BROWN5, LENSES
 from pipeline.logs.channels import IMAGE
 from pipeline.logs.reader import read_log
 from pipeline.report.intrinsics_sheet import intrinsics_sheet
-from pipeline.stages.calibrated import provenance, put_into, put_sheet
+from pipeline.runs import sha256_of_file
+from pipeline.stages.calibrated import lens_table, provenance, put_into, put_sheet
 
 COMMAND = "gradetrace calibrate intrinsics"
 MOST_PICTURES = 400
@@ -144,7 +145,11 @@ def calibrate_intrinsics(
     sha256 = _hash_of(source)
     name = camera or source.stem
     sheet = intrinsics_sheet(found, name, printed.text, searched, _origin(source, topic, sha256, date))
-    values = _values(found, provenance(date, COMMAND, source, sha256)) if lens is BROWN5 else None
+    told = found.solution
+    values = None
+    if lens is BROWN5:
+        stamp = provenance(date, COMMAND, source, sha256)
+        values = lens_table(found.size, told.intrinsics, told.covariance, stamp)
     out = out or Path(f"intrinsics-{name}.html")
     put_sheet(sheet, out)
     kept = None
@@ -242,30 +247,14 @@ def _day_of(path: Path) -> datetime.date:
 
 def _hash_of(source: Path) -> str:
     """sha256 of a file, or of the names and hashes of the pictures in a folder."""
-    digest = hashlib.sha256()
     if source.is_file():
-        with source.open("rb") as stream:
-            while block := stream.read(1 << 20):
-                digest.update(block)
-        return digest.hexdigest()
+        return sha256_of_file(source)
+    digest = hashlib.sha256()
     for file in sorted(path for path in source.iterdir() if path.suffix.lower() in PICTURES):
-        digest.update(f"{file.name} {hashlib.sha256(file.read_bytes()).hexdigest()}\n".encode())
+        digest.update(f"{file.name} {sha256_of_file(file)}\n".encode())
     return digest.hexdigest()
 
 
 def _origin(source: Path, topic: str, sha256: str, date: datetime.date) -> dict[str, str]:
     recorded = {"recorded": date.isoformat(), "file": source.name, "sha256": sha256}
     return recorded | ({"topic": topic} if topic else {})
-
-
-def _values(found: Intrinsics, calibrated: dict[str, object]) -> dict[str, object]:
-    """A [cameras.NAME.intrinsics] table."""
-    k = found.solution.intrinsics
-    return {
-        "width": found.size[0],
-        "height": found.size[1],
-        **{name: float(value) for name, value in zip(("fx", "fy", "cx", "cy"), k)},
-        "distortion": k[4:],
-        "covariance": found.solution.covariance,
-        "calibrated": calibrated,
-    }

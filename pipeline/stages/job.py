@@ -327,9 +327,22 @@ def open_job(
     ConfigError
         A description is missing or wrong, or a file it names cannot be used.
     """
+    job = open_log(log, machine, site, RunFolder(runs / log.stem), workers, strict, create_folder)
+    return replace(job, files=named_files(job.site, job.site_source, job.folder))
+
+
+def open_log(
+    log: Path,
+    machine: Path | None,
+    site: Path | None,
+    folder: RunFolder,
+    workers: int = 1,
+    strict: bool = False,
+    create_folder: bool = False,
+) -> Job:
+    """The same without the files that site.toml names: for who needs only what the log shows. Raises as `open_job`."""
     check_log_file(log)
     machine_model, machine_source, site_model, site_source = describe(log, machine, site)
-    folder = RunFolder(runs / log.stem)
     if create_folder:
         folder.create()
     return Job(
@@ -340,7 +353,7 @@ def open_job(
         site=site_model,
         machine_source=machine_source,
         site_source=site_source,
-        files=named_files(site_model, site_source, folder),
+        files={},
         workers=workers,
         strict=strict,
     )

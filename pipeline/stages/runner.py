@@ -87,20 +87,24 @@ def run_stale(job: Job, watch: Watch, last: str = "") -> list[str]:
     """
     ran = []
     for stage in STAGES:
-        now = plan(job, stage)
-        why = job.folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
-        if why is not None:
-            run_stage(job, stage, now, watch, why)
+        if run_if_stale(job, stage, watch):
             ran.append(stage.name)
-        manifest = job.folder.manifest(stage.name)
-        if manifest is None:
-            raise ArtefactError(
-                f"{job.folder.path}: the manifest of {stage.name} vanished while it was written"
-            )
-        watch.done(stage, manifest, ran=why is not None)
         if stage.name == last:
             break
     return ran
+
+
+def run_if_stale(job: Job, stage: Stage, watch: Watch) -> bool:
+    """Run one stage unless it is up to date; whether it ran. Raises PipelineError."""
+    now = plan(job, stage)
+    why = job.folder.why_stale(stage.name, stage.version, now.inputs, now.settings, now.schemas)
+    if why is not None:
+        run_stage(job, stage, now, watch, why)
+    manifest = job.folder.manifest(stage.name)
+    if manifest is None:
+        raise ArtefactError(f"{job.folder.path}: the manifest of {stage.name} vanished while it was written")
+    watch.done(stage, manifest, ran=why is not None)
+    return why is not None
 
 
 def run_stage(job: Job, stage: Stage, now: Plan, watch: Watch, why: str) -> None:

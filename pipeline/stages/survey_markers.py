@@ -18,8 +18,7 @@ from pipeline.config.quantities import Print
 from pipeline.errors import CalibrationError
 from pipeline.geometry import so3
 from pipeline.report.survey_sheet import survey_sheet
-from pipeline.stages.calibrate_cluster import Written, written_covariance
-from pipeline.stages.calibrated import provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, demand_of, provenance, put_into, put_sheet, written_covariance
 from pipeline.surface.shots import Shots, read_shots
 
 COMMAND = "survey"
@@ -74,9 +73,7 @@ def run(
     sheet = survey_sheet(
         poses,
         markers,
-        tolerance_m=min(model.tolerance.high_mm, model.tolerance.low_mm) / 1000,
-        coverage_factor=model.tolerance.coverage_factor,
-        distance_m=distance_m,
+        demand_of(model, distance_m),
         subject=model.site.id,
         origin={file.name: f"sha256 {stamp['sha256'][:12]}", "surveyed": day.isoformat()},
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.calibration import bucket
+from pipeline.calibration import standings as t
 from pipeline.calibration.agreement import kept_of
 from pipeline.config import load_machine
 from pipeline.config.rewriting import with_values
@@ -13,7 +14,6 @@ from pipeline.errors import CalibrationError
 from pipeline.estimation.sensitivities import Sensitivities, Source
 from pipeline.network import network_of
 from pipeline.report.bucket_sheet import BucketFacts
-from pipeline.stages import touched as t
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values
 from pipeline.stages.calibrate_bucket import sensor_of
 from pipeline.surface.parked import KnownPoint

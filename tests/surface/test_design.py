@@ -261,6 +261,15 @@ def test_a_design_of_another_place_or_unit_is_refused_with_the_likely_cause(tmp_
         read_design(xml, site("design.xml", "landxml"))
 
 
+def test_elevations_in_another_unit_than_the_benchmarks_are_refused(tmp_path):
+    # 50 m are 164 ft: near enough to grid.origin for another height datum, and further from the boards than one digs.
+    csv = profile(tmp_path, "station,elevation,width,side_slope\n0,164.04,1,0\n20,164.04,1,0\n")
+    with pytest.raises(SurfaceError, match=r"lies at 164\.04, 114 m from the nearest benchmark \(50\.00\)"):
+        read_design(csv, site("design.csv", "profile_csv"))
+    deep = profile(tmp_path, "station,elevation,width,side_slope\n0,12,1,0\n20,12,1,0\n")
+    assert read_design(deep, site("design.csv", "profile_csv"))[0].floor_level(5.0) == 12.0
+
+
 def test_an_alignment_with_swapped_axes_is_refused(tmp_path):
     csv = profile(tmp_path, "station,elevation,width,side_slope\n0,50,1,0\n20,50,1,0\n")
     swapped = site("design.csv", "profile_csv", points=[[4_123_000, 512_000], [4_123_020, 512_000]])
