@@ -1,4 +1,4 @@
-"""Errors of calibrated quantities over their stated sigmas, figures of procedures, and the bars they are held against."""
+"""Errors of calibrated quantities over their stated sigmas, figures of procedures, and the bars for both."""
 
 from __future__ import annotations
 

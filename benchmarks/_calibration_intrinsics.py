@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-
 import numpy as np
 
-from benchmarks._calibration_bars import Normalised, normalised
+from benchmarks._calibration_bars import Normalised, Row, normalised
+from benchmarks._calibration_rigs import drawn
 from pipeline.calibration.board import parse_board
 from pipeline.calibration.corners import CornerFinder
 from pipeline.calibration.procedure import calibrate_lens
@@ -47,17 +45,14 @@ def errors_of(seed: int) -> tuple[np.ndarray, float, float]:
     return error / found.solution.sigma, together, found.placing.total_m
 
 
-def intrinsics(draws: int) -> list[Normalised]:
+def intrinsics(draws: int) -> list[Row]:
     """Intrinsics of drawn cameras: all nine, and each for itself."""
-    with multiprocessing.get_context("spawn").Pool(os.cpu_count()) as pool:
-        drawn = list(pool.imap(errors_of, range(draws)))
-    z = np.array([one[0] for one in drawn])
-    place_mm = 1000 * float(np.median([one[2] for one in drawn]))
-    rows = [normalised("intrinsics", z, note=f"a tag's place to {place_mm:.1f} mm at 10 m, median")]
-    together = np.sqrt(np.array([one[1] for one in drawn]))
-    rows.append(
-        Normalised(
-            "intrinsics, with correlations", draws, float(np.sqrt(np.mean(together**2))), np.nan, False
-        )
-    )
-    return rows + [normalised(name, z[:, i], held=False) for i, name in enumerate(BROWN5.parameters)]
+    lenses = drawn(errors_of, draws)
+    z = np.array([one[0] for one in lenses])
+    place_mm = 1000 * float(np.median([one[2] for one in lenses]))
+    together = float(np.sqrt(np.mean([one[1] for one in lenses])))
+    return [
+        normalised("intrinsics", z, note=f"a tag's place to {place_mm:.1f} mm at 10 m, median"),
+        Normalised("intrinsics, with correlations", draws, together, np.nan, False),
+        *(normalised(name, z[:, i], held=False) for i, name in enumerate(BROWN5.parameters)),
+    ]

@@ -158,7 +158,7 @@ def halves_disagree(
     Parameters
     ----------
     whole, odd, even : Adjusted
-        Of one network.
+        Of one network, that of the whole: a tag that one half never saw has its errors among the statics there too.
     names : list of str
         Statics that are poses.
 

@@ -251,7 +251,9 @@ def cluster_of(
     if whole.sigma0 > WRONG_SIGMA0:
         raise CalibrationError(_contradiction(whole))
     odd, even = (
-        adjusted(network, _every_second(observations, half), settings=site.estimation, repeated=repeated)
+        adjusted(
+            whole.network, _every_second(observations, half), settings=site.estimation, repeated=repeated
+        )
         for half in (0, 1)
     )
     names = [camera.name for camera in network.cameras]

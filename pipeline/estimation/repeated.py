@@ -56,18 +56,22 @@ def offset_name(network: Network, camera: int, tag: int) -> str:
 def with_offsets(network: Network, observations: Observations, repeated: Repeated) -> Network:
     """The network with the constant errors among its statics, one per camera and tag that met.
 
-    Each has eight components, px: u and v of the four corners, with the share of the median stated variance.
+    Each has eight components, px: u and v of the four corners, with the share of the median stated variance. Those that
+    are among the statics already stay as they are: half of a log has the errors of the whole.
     """
     if repeated.constant <= 0:
         return network
+    there = {static.name for static in network.statics if static.source == SOURCE}
     pairs = np.unique(np.stack([observations.camera, observations.tag], axis=1), axis=0)
     offsets = []
     for camera, tag in pairs.tolist():
+        name = offset_name(network, camera, tag)
+        if name in there:
+            continue
         cov = np.median(observations.cov[(observations.camera == camera) & (observations.tag == tag)], axis=0)
         prior = np.zeros((8, 8))
         for k in range(4):
             prior[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = repeated.constant * cov[k]
-        name = offset_name(network, camera, tag)
         offsets.append(Static(name, SOURCE, False, np.zeros(8), prior, OFFSET_COMPONENTS, ("px",) * 8))
     return replace(network, statics=(*network.statics, *offsets))
 

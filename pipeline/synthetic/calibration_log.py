@@ -53,17 +53,7 @@ def record_calibration(
     Path
         The log.
     """
-    return record_site(calibration_site(name, seed), name, folder, jobs, progress)
-
-
-def record_site(
-    site: CalibrationSite,
-    name: str,
-    folder: Path,
-    jobs: int,
-    progress: Callable[[int, int], None] = lambda done, of: None,
-) -> Path:
-    """The same of a site that was changed since it was drawn; with one job only, or what is rendered is not it."""
+    site = calibration_site(name, seed)
     folder.mkdir(parents=True, exist_ok=True)
     machine, site_text = machine_text(site), site_toml(site)
     for file, text in (

@@ -105,6 +105,17 @@ def test_errors_and_halves_scatter_as_their_covariances_say():
     assert 3.5 < np.mean(halves) < 9.0
 
 
+def test_a_tag_that_only_one_half_of_the_log_saw_is_compared_all_the_same(yard):
+    drawn, _, site, network = yard
+    rows = seen(drawn, network, np.random.default_rng(0))
+    shy = rows.tag[0]
+    rows = rows.take((rows.tag != shy) | (np.arange(len(rows.tag)) == np.flatnonzero(rows.tag == shy)[0]))
+    found = cluster_of(network, rows, site, "bench")  # with the errors that come back among the statics
+    xi, expected = found.cross["arm"]
+    # 99.9 % of a chi-square of six.
+    assert xi @ np.linalg.solve(expected, xi) < 22.5
+
+
 def test_a_camera_that_shares_no_instant_is_named(yard):
     drawn, _, site, network = yard
     apart = seen(drawn, network, np.random.default_rng(0), delay_s=1.0)
