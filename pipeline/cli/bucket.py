@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, usable_cores
+from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, say_written, usable_cores
 
 
 @click.command()
@@ -52,6 +52,4 @@ def bucket(
     wanted = Wanted(
         log, checks, machine, site, runs, point, tooth, sensor, contact_mm, wear, jobs or usable_cores()
     )
-    done = calibrate_bucket(wanted, watch_on())
-    click.echo(done.sentence)
-    click.echo(f"written: {done.machine_file} (before: {done.kept.name}) · sheet {done.sheet}")
+    say_written(calibrate_bucket(wanted, watch_on()))

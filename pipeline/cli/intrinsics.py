@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.cli.options import FILE, distance
+from pipeline.cli.options import FILE, distance, say_written
 
 
 @click.command()
@@ -37,7 +37,7 @@ from pipeline.cli.options import FILE, distance
     show_default=True,
     help="Model of the lens; machine.toml holds brown5.",
 )
-@distance(10.0, "Working distance at which millimetres are told.")
+@distance(10.0, "Working distance at which millimetres are told.", 0.1, 1000)
 @click.option(
     "--size", metavar="WxH", default="", help="Size of the pictures, px; only of a corner file (vnl)."
 )
@@ -67,7 +67,7 @@ def intrinsics(
     wanted = re.fullmatch(r"(\d{2,5})x(\d{2,5})", size)
     if size and wanted is None:
         raise click.BadParameter(f"'{size}' is no size; for example 1280x720", param_hint="--size")
-    done = calibrate_intrinsics(
+    written = calibrate_intrinsics(
         source,
         board,
         camera,
@@ -79,12 +79,7 @@ def intrinsics(
         out,
         _tell if sys.stderr.isatty() else lambda pictures: None,
     )
-    click.echo(done.sentence)
-    for remark in done.remarks:
-        click.echo(f"! {remark}")
-    if done.kept is not None:
-        click.echo(f"written into {machine}: cameras.{camera}.intrinsics; the old file is {done.kept}")
-    click.echo(f"sheet: {done.sheet}")
+    say_written(written)
 
 
 def _tell(pictures: int) -> None:

@@ -14,7 +14,7 @@ from pipeline.cli.options import FILE, LOG, MACHINE, RUNS, SITE, distance, usabl
 @MACHINE
 @SITE
 @RUNS
-@distance(10.0, "Working distance at which millimetres are told.")
+@distance(10.0, "Working distance at which millimetres are told.", 0.1, 1000)
 @click.option(
     "--out",
     metavar="FILE",

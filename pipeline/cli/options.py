@@ -41,13 +41,13 @@ JOBS = click.option(
 )
 
 
-def distance(default: float, what: str) -> Any:
+def distance(default: float, what: str, least: float = 0.5, most: float = 100) -> Any:
     """The option `--distance`, handed on as `distance_m`: where millimetres are told."""
     return click.option(
         "--distance",
         "distance_m",
         metavar="METRES",
-        type=click.FloatRange(0.1, 1000),
+        type=click.FloatRange(least, most),
         default=default,
         show_default=True,
         help=what,
@@ -75,6 +75,6 @@ def say_written(written: Any) -> None:
     click.echo(written.sentence)
     for remark in written.remarks:
         click.echo(f"! {remark}")
-    if written.kept is not None:
+    if written.file is not None:
         click.echo(f"written: {written.file}; the old file is {written.kept.name}")
     click.echo(f"sheet: {written.sheet}")

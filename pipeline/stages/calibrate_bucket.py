@@ -19,7 +19,7 @@ from pipeline.report.sheet import SHARE
 from pipeline.runs import RunFolder
 from pipeline.stages import stage_named
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
-from pipeline.stages.calibrated import put_into, put_sheet
+from pipeline.stages.calibrated import Written, put_into, put_sheet
 from pipeline.stages.calibration_log import machine_to_write
 from pipeline.stages.job import Job, open_log
 from pipeline.stages.runner import Watch, run_if_stale
@@ -48,18 +48,7 @@ class Wanted:
     workers: int = 1
 
 
-@dataclass(frozen=True)
-class Calibrated:
-    """What was done."""
-
-    facts: BucketFacts
-    sentence: str
-    kept: Path
-    machine_file: Path
-    sheet: Path
-
-
-def calibrate_bucket(wanted: Wanted, watch: Watch) -> Calibrated:
+def calibrate_bucket(wanted: Wanted, watch: Watch) -> Written:
     """Calibrate, write machine.toml and the sheet; nothing is written where anything is wrong.
 
     Raises
@@ -105,10 +94,10 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Calibrated:
             machine_sha256=job.machine_source.sha256,
         )
         values = wear_values(machine, facts) if kept is None else values_of(machine, joint, name, kept, facts)
-        sheet, page = folder.file("bucket.html"), bucket_sheet(facts)
-        put_sheet(page, sheet)
+        sheet, page = bucket_sheet(facts), folder.file("bucket.html")
+        put_sheet(sheet, page)
         before = put_into(machine_file, "machine", values)
-    return Calibrated(facts, page.sentence, before, machine_file, sheet)
+    return Written(sheet.sentence, tuple(sheet.remarks), page, machine_file, before)
 
 
 def sensor_of(machine: Machine, asked: str | None) -> str:

@@ -32,9 +32,9 @@ class Written:
     """Whether it is good enough, in one line."""
     remarks: tuple[str, ...]
     sheet: Path
-    file: Path
-    """With the new values."""
-    kept: Path
+    file: Path | None
+    """With the new values; None where there is only the sheet."""
+    kept: Path | None
     """The file as it was."""
 
 

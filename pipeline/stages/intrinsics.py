@@ -24,7 +24,7 @@ from pipeline.logs.channels import IMAGE
 from pipeline.logs.reader import read_log
 from pipeline.report.intrinsics_sheet import intrinsics_sheet
 from pipeline.runs import sha256_of_file
-from pipeline.stages.calibrated import lens_table, provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, lens_table, provenance, put_into, put_sheet
 
 COMMAND = "gradetrace calibrate intrinsics"
 MOST_PICTURES = 400
@@ -45,16 +45,10 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class Done:
-    """What was written."""
+class LensWritten(Written):
+    """What was written, and the lens."""
 
     found: Intrinsics
-    sheet: Path
-    state: str
-    sentence: str
-    kept: Path | None
-    """The old machine.toml; None where nothing was written into one."""
-    remarks: tuple[str, ...]
 
 
 def calibrate_intrinsics(
@@ -68,7 +62,7 @@ def calibrate_intrinsics(
     size: tuple[int, int] | None = None,
     out: Path | None = None,
     watch: Watch = lambda pictures: None,
-) -> Done:
+) -> LensWritten:
     """Calibrate one camera from a recording of a board.
 
     Parameters
@@ -155,7 +149,9 @@ def calibrate_intrinsics(
     kept = None
     if machine is not None and values is not None:
         kept = put_into(machine, "machine", {f"cameras.{camera}.intrinsics": values})
-    return Done(found, out, sheet.state, sheet.sentence, kept, tuple(sheet.remarks))
+    return LensWritten(
+        sheet.sentence, tuple(sheet.remarks), out, machine if kept is not None else None, kept, found
+    )
 
 
 def _topic_of(machine: Path, camera: str) -> str:
