@@ -37,6 +37,7 @@ from pipeline.estimation.values import Values
 from pipeline.network import frames as fr
 
 CLASSES = ("working", "parked", "tramming")
+PARKED = CLASSES.index("parked")
 WINDOW_S = 2.0
 STILL_SIGMAS = 7.0
 """Range of a corner's coordinate over the window, in its sigmas, below which nothing moved: of twenty normal draws
@@ -80,11 +81,11 @@ def shaking(problem: Problem) -> Problem:
     return replace(problem, densities=tuple(q[..., :1] * both for q in problem.densities))
 
 
-def configured(problem: Problem, values: Values) -> list[Densities]:
-    """Every interval sorted, with the densities of the problem: the start."""
+def configured(problem: Problem, values: Values, window_s: float = WINDOW_S) -> list[Densities]:
+    """Every interval sorted, with the densities of the problem: the start. Parked is what is still for a window."""
     out = []
     for k, variable in enumerate(problem.tie.variables):
-        label = np.where(parked(problem, k), 1, 0)
+        label = np.where(parked(problem, k, window_s), PARKED, 0)
         frame = fr.body_frame(variable.body)
         if variable.kind == "moving" and problem.tie.frames.edges[frame].parent == fr.WORLD:
             label[tramming(problem, values, k)] = 2
@@ -112,8 +113,8 @@ class Increments:
                 self.total[k][c] += square[label == c].sum(axis=0)
                 self.known[k][c] += told[label == c].sum(axis=0)
 
-    def learned(self) -> list[Densities]:
-        """One round: densities at which the marginal likelihood of these states is stationary."""
+    def learned(self, classes: tuple[int, ...] = tuple(range(len(CLASSES)))) -> list[Densities]:
+        """One round: densities of some classes at which the marginal likelihood of these states is stationary."""
         out = []
         for k, variable in enumerate(self.problem.tie.variables):
             old, known, total = self.now[k], self.known[k].copy(), self.total[k].copy()
@@ -133,7 +134,12 @@ class Increments:
             density = old.density * np.where(known.sum(axis=-1)[..., None] < ENOUGH, 1.0, factor)
             floor = LEAST_SHARE * motion.density_of(variable.kind, variable.motion)[:, 0]
             density[..., 0] = np.maximum(density[..., 0], floor)
-            out.append(Densities(old.label, density, count))
+            told = np.isin(np.arange(len(CLASSES)), classes)[:, None]
+            out.append(
+                Densities(
+                    old.label, np.where(told[..., None], density, old.density), np.where(told, count, 0.0)
+                )
+            )
         return out
 
 
@@ -227,7 +233,7 @@ def _shares(problem: Problem, values: Values, found: Marginals, k: int):
     return np.moveaxis(square, 0, -1), np.moveaxis(told, 0, -1)
 
 
-def parked(problem: Problem, k: int):
+def parked(problem: Problem, k: int, window_s: float = WINDOW_S):
     """(E - 1,) bool: between two epochs at which everything that shows this variable shows nothing but noise.
 
     Only the pictures that show least else count: a stick at rest is not in motion because the bucket on it turns.
@@ -246,13 +252,13 @@ def parked(problem: Problem, k: int):
             epoch = group.epoch[rows]
             sigma = np.sqrt(np.einsum("nkii->nki", seen_obs.cov[group.rows[rows]]))
             here = _quiet(group.uv[rows].reshape(len(epoch), 8), sigma.reshape(len(epoch), 8),
-                          problem.epochs.time_s[epoch])  # fmt: skip
+                          problem.epochs.time_s[epoch], window_s)  # fmt: skip
             still[epoch] &= here
             seen[epoch] = True
     for readings in problem.sensors:
         if readings.variable == k:
             sigma = np.full((len(readings.raw), 1), max(readings.sensor.noise, 1e-12))
-            here = _quiet(readings.raw[:, None], sigma, problem.epochs.time_s[readings.epoch])
+            here = _quiet(readings.raw[:, None], sigma, problem.epochs.time_s[readings.epoch], window_s)
             np.logical_and.at(still, readings.epoch, here)
             seen[readings.epoch] = True
     at = np.flatnonzero(seen)
@@ -261,15 +267,15 @@ def parked(problem: Problem, k: int):
     # An interval is parked where the last sighting before it and the first one after it are.
     before = at[np.clip(np.searchsorted(at, np.arange(E - 1), side="right") - 1, 0, None)]
     after = at[np.clip(np.searchsorted(at, np.arange(1, E)), None, len(at) - 1)]
-    near = problem.epochs.time_s[after] - problem.epochs.time_s[before] < WINDOW_S
+    near = problem.epochs.time_s[after] - problem.epochs.time_s[before] < window_s
     return still[before] & still[after] & near
 
 
-def _quiet(values, sigma, time_s):
+def _quiet(values, sigma, time_s, window_s):
     """(n,) bool: the range of every column over the window around each row is that of noise."""
     if len(values) < 4:
         return np.zeros(len(values), dtype=bool)
-    width = max(3, round(WINDOW_S / max(float(np.median(np.diff(time_s))), 1e-3)) | 1)
+    width = max(3, round(window_s / max(float(np.median(np.diff(time_s))), 1e-3)) | 1)
     width = min(width, 2 * len(values) - 1)
     span = maximum_filter1d(values, width, axis=0, mode="nearest") - minimum_filter1d(
         values, width, axis=0, mode="nearest"

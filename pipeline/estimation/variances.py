@@ -49,12 +49,16 @@ def settle(
     settings: EstimationSettings,
     repeated: Repeated,
     checkpoint: Checkpoint = FORGETFUL,
+    window_s: float = motion_densities.WINDOW_S,
+    classes: tuple[int, ...] = tuple(range(len(motion_densities.CLASSES))),
 ) -> Settled:
     """Learn the variances, starting from an optimum with the configured ones.
 
+    Parked is what stands still for `window_s`; densities of other than the `classes` stay as they are.
+
     If the adjustment does not converge with what was learned, that optimum comes back as it was.
     """
-    densities = start = motion_densities.configured(problem, optimum.values)
+    densities = start = motion_densities.configured(problem, optimum.values, window_s)
     trial, at, shares, rounds = problem, optimum, repeated, 0
     likely: list[float] = []
     for _ in range(ROUNDS):
@@ -62,7 +66,7 @@ def settle(
         for part, found in marginals_by_part(trial, at.values, at.weights):
             increments.add(part, found)
         likely.append(log_likelihood(trial, at, found.log_det))
-        new = increments.learned()
+        new = increments.learned(classes)
         told = told_by(trial, at, settings.huber) if repeated.resting > 0 else None
         moved = motion_densities.moved_by(densities, new)
         trial = replace(

@@ -33,7 +33,7 @@ RING = (
 TAG_M, GAP_M = 0.45, 0.08
 STOPS_DEG = (-45.0, -32.0, -19.0, -6.0, 8.0, 21.0, 34.0, 45.0, 27.0, 14.0, 1.0, -13.0, -26.0, -38.0)
 """Where the swing stops."""
-REST_S, TURN_S = 0.9, 1.5
+REST_S, TURN_S = 2.0, 1.5
 WAVE_S = 48.0
 BUCKET_BOARD = BoardPlan("bucket-board", 80, 2, 2, 0.20, 0.05, 0.04)
 BUCKET_MARKER = (0.45, 0.30, -0.72)
