@@ -57,8 +57,11 @@ def score(log: Path, runs: Path) -> Score:
         check=True,
         stdout=subprocess.DEVNULL,
     )
-    seconds = time.monotonic() - start
-    run = runs / log.stem
+    return score_of(log, runs / log.stem, time.monotonic() - start)
+
+
+def score_of(log: Path, run: Path, seconds: float = float("nan")) -> Score:
+    """What a run of a log came to, held against the truth beside the log."""
     edge = read_table(run / "cutting_edge.parquet", "cutting_edge")
     truth = pq.read_table(log.parent / "truth" / "cutting_edge.parquet").to_pandas()
     truth = truth[truth["point"] == "middle"].sort_values("time_ns")

@@ -9,7 +9,7 @@ import time
 from pathlib import Path
 
 from pipeline.errors import PipelineError
-from pipeline.synthetic import calibration_sites, command
+from pipeline.synthetic import calibration_sites, command, yard
 from pipeline.synthetic.calibration_logs import LOGS
 
 DRAWN_LOGS = 5
@@ -25,8 +25,8 @@ def main(arguments: list[str] | None = None) -> None:
     )
     parser.add_argument(
         "--site",
-        choices=(*command.SITES, *LOGS, *calibration_sites.NAMES),
-        help="which site; one log of it is made",
+        choices=(*command.SITES, *LOGS, *calibration_sites.NAMES, yard.NAME),
+        help=f"which site; one log of it is made ({yard.NAME}: those of all calibrations in one folder)",
     )
     parser.add_argument("--size", choices=tuple(command.SIZES), help="640 (640x480) or 1280 (1280x960)")
     parser.add_argument("--minutes", type=float, help="at least this long, in whole cycles")
@@ -43,7 +43,8 @@ def main(arguments: list[str] | None = None) -> None:
     if wanted.sample:
         _make(wanted.jobs, folder=wanted.folder)
     elif any(value is not None for value in one):
-        small = wanted.site in calibration_sites.NAMES or (wanted.minutes is None and wanted.seed is None)
+        own_size = (*calibration_sites.NAMES, yard.NAME)
+        small = wanted.site in own_size or (wanted.minutes is None and wanted.seed is None)
         _make(
             wanted.jobs,
             folder=wanted.folder,
@@ -71,7 +72,7 @@ def _make(jobs: int, **what) -> None:
             sys.stderr.flush()
 
     path = command.make(jobs=jobs, progress=progress, **what)
-    size = path.stat().st_size / 1e6
+    size = sum(p.stat().st_size for p in (path.rglob("*") if path.is_dir() else [path])) / 1e6
     sys.stdout.write(f"{path}: {size:.1f} MB in {time.monotonic() - begun:.0f} s\n")
 
 

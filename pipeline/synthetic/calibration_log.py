@@ -21,7 +21,9 @@ from pipeline.synthetic.calibration_sites import (
     CalibrationSite,
     calibration_site,
 )
-from pipeline.synthetic.excavator import board
+from pipeline.synthetic.draws import Uncertainty
+from pipeline.synthetic.excavator import Mounts, board
+from pipeline.synthetic.specification import Specification
 
 SLICE_FRAMES = 12
 CORNER_NAMES = ("TL", "TR", "BR", "BL")
@@ -34,6 +36,7 @@ def record_calibration(
     folder: Path,
     jobs: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
+    machine: str | None = None,
 ) -> Path:
     """Write a calibration log and all files beside it; the same bytes for any number of jobs.
 
@@ -47,6 +50,8 @@ def record_calibration(
         Processes that render.
     progress
         Called with frames written and frames in all.
+    machine
+        Text of a machine.toml that several logs share; left out, the log has one of its own beside it.
 
     Returns
     -------
@@ -55,9 +60,11 @@ def record_calibration(
     """
     site = calibration_site(name, seed)
     folder.mkdir(parents=True, exist_ok=True)
-    machine, site_text = machine_text(site), site_toml(site)
+    site_text = site_toml(site)
+    if machine is None:
+        machine = machine_text(site.spec, site.files, site.sigma, bucket_board=site.bucket_marker is not None)
+        (folder / "machine.toml").write_text(machine, encoding="utf-8", newline="\n")
     for file, text in (
-        ("machine.toml", machine),
         ("site.toml", site_text),
         ("design.csv", survey.design_csv(site.spec)),
         ("corners.csv", corner_shots(site)),
@@ -72,18 +79,18 @@ def record_calibration(
     return path
 
 
-def machine_text(site: CalibrationSite) -> str:
-    """Text of machine.toml; the board on the bucket hangs where nobody has measured."""
-    text = files.machine_toml(site.spec, site.files, site.sigma)
-    if site.bucket_marker is None:
+def machine_text(spec: Specification, said: Mounts, sigma: Uncertainty, bucket_board: bool) -> str:
+    """Text of machine.toml; the board on the bucket, where there is one, hangs where nobody has measured."""
+    text = files.machine_toml(spec, said, sigma)
+    if not bucket_board:
         return text
-    made = board(BUCKET_BOARD, site.spec.family)
+    made = board(BUCKET_BOARD, spec.family)
     lines = [
         "",
         "# Held to the bucket by magnets while its axis is calibrated; nobody has measured where.",
         f"[markers.{BUCKET_BOARD.name}]",
         'body = "bucket"',
-        f'family = "{site.spec.family}"',
+        f'family = "{spec.family}"',
         "tags = [",
         *[
             f"  {{ id = {tag}, size_m = {made.tag_m}, x_m = {x:.4f}, y_m = {y:.4f} }},"

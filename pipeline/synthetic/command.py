@@ -8,7 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from pipeline.errors import UsageError
-from pipeline.synthetic import calibration_log, calibration_sites, recording, specification, touched_stake
+from pipeline.synthetic import (
+    calibration_log,
+    calibration_sites,
+    recording,
+    specification,
+    touched_stake,
+    yard,
+)
 from pipeline.synthetic.calibration_logs import LOGS
 from pipeline.synthetic.cycle import CYCLE_S, TRAM_S
 from pipeline.synthetic.specification import Specification
@@ -63,7 +70,8 @@ def make(
         Left out: ``sample_logs/trench`` for the committed sample, else ``sample_logs/generated/<name>``.
     site
         ``trench`` or ``other``; ``calibration-bucket``, ``calibration-cluster`` or ``calibration-mounts``, of the
-        machine of the sample of this seed; or one of `calibration_logs.LOGS`: a log that calibrates its lenses.
+        machine of the sample of this seed; one of `calibration_logs.LOGS`: a log that calibrates its lenses; or
+        ``calibration``: all of them in one folder beside one machine.toml, which is returned.
     minutes
         At least this long, in whole cycles; left out, the site's own four cycles.
     size
@@ -82,10 +90,12 @@ def make(
     if site in LOGS:
         default = DRAWN / (site if (size, seed) == ("640", SAMPLE_SEED) else f"{site}-{size}-{seed}")
         return LOGS[site](specification_of(size=size), seed, default if folder is None else folder, progress)
-    if site in calibration_sites.NAMES:
+    if site == yard.NAME or site in calibration_sites.NAMES:
         if minutes is not None or size != "640":
             raise UsageError(f"'{site}' has a length and a size of its own: leave out --minutes and --size")
         default = DRAWN / f"{site}-{seed}"
+        if site == yard.NAME:
+            return yard.record_yard(seed, default if folder is None else folder, jobs, progress)
         return calibration_log.record_calibration(
             site, seed, default if folder is None else folder, jobs, progress
         )

@@ -90,6 +90,7 @@ def record(
     folder: Path,
     jobs: int,
     progress: Callable[[int, int], None] = lambda done, of: None,
+    machine: str | None = None,
 ) -> Path:
     """Write a site's log and all files beside it; the same bytes for any number of jobs.
 
@@ -103,6 +104,8 @@ def record(
         Processes that render.
     progress
         Called with frames written and frames in all.
+    machine
+        Text of a machine.toml that several logs share; left out, the log has one of its own beside it.
 
     Returns
     -------
@@ -111,10 +114,11 @@ def record(
     """
     w = world(spec, seed)
     folder.mkdir(parents=True, exist_ok=True)
-    machine = files.machine_toml(spec, w.files, w.sigma)
+    if machine is None:
+        machine = files.machine_toml(spec, w.files, w.sigma)
+        (folder / "machine.toml").write_text(machine, encoding="utf-8", newline="\n")
     site = files.site_toml(spec, w.files)
     for name, text in (
-        ("machine.toml", machine),
         ("site.toml", site + files.afterwards_toml(spec)),
         ("design.csv", survey.design_csv(spec)),
         ("design.xml", survey.design_xml(spec)),

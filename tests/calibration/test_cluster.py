@@ -22,7 +22,9 @@ START_NS = 1_750_000_000_000_000_000
 def yard():
     """Machine, site, truth and network of one drawn rig."""
     drawn = calibration_sites.calibration_site(calibration_sites.CLUSTER, 4)
-    machine = load_machine(calibration_log.machine_text(drawn), "machine.toml")
+    machine = load_machine(
+        calibration_log.machine_text(drawn.spec, drawn.files, drawn.sigma, bucket_board=False), "machine.toml"
+    )
     site = load_site(calibration_log.site_toml(drawn), "site.toml")
     return drawn, machine, site, network_of(cluster_machine(machine, "bench"), site)
 
@@ -90,7 +92,10 @@ def test_errors_and_halves_scatter_as_their_covariances_say():
     lengths, halves = [], []
     for seed in range(12):
         drawn = calibration_sites.calibration_site(calibration_sites.CLUSTER, 100 + seed)
-        machine = load_machine(calibration_log.machine_text(drawn), "machine.toml")
+        machine = load_machine(
+            calibration_log.machine_text(drawn.spec, drawn.files, drawn.sigma, bucket_board=False),
+            "machine.toml",
+        )
         site = load_site(calibration_log.site_toml(drawn), "site.toml")
         network = network_of(cluster_machine(machine, "bench"), site)
         found = cluster_of(
