@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.calibration.adjusted import Adjusted, adjusted
 from pipeline.calibration.axes import TOLD, Axis, axis_of_motion
 from pipeline.calibration.cluster import EXACT, WRONG_SIGMA0
+from pipeline.calibration.pins import PinFit, PinShot, axis_static, with_pins
 from pipeline.config import Machine, Site
 from pipeline.config.machine import CuttingEdge, JointBody, MovingBody
 from pipeline.errors import CalibrationError
@@ -51,6 +52,8 @@ class Mounts:
     whole: Adjusted
     told: tuple[ToldPose, ...]
     warnings: tuple[str, ...]
+    pins: tuple[PinFit, ...] = ()
+    """Shots of pins, where there were any."""
 
 
 def static_of(key: str) -> str:
@@ -67,9 +70,13 @@ _KINDS = {("markers", "mount"): "marker", ("cameras", "mount"): "camera", ("bodi
 
 
 def calibrate_mounts(
-    machine: Machine, site: Site, free: Sequence[str], detections: Mapping[str, Mapping[str, np.ndarray]]
+    machine: Machine,
+    site: Site,
+    free: Sequence[str],
+    detections: Mapping[str, Mapping[str, np.ndarray]],
+    pins: Sequence[PinShot] = (),
 ) -> Mounts:
-    """Mounts and axes that a log tells.
+    """Mounts and axes that a log tells, and surveyed pins.
 
     Parameters
     ----------
@@ -79,6 +86,8 @@ def calibrate_mounts(
         Keys of machine.toml to be told; mounts that it leaves out are told anyway.
     detections : mapping
         By camera: columns of the table ``detections``.
+    pins : sequence of PinShot
+        Their joints' axes are told whether named or not; no marker need hang on what turns about them.
 
     Raises
     ------
@@ -87,15 +96,19 @@ def calibrate_mounts(
     """
     from pipeline.estimation.table import observations_of
 
-    keys = _keys(machine, free)
+    surveyed = tuple(dict.fromkeys(shot.joint for shot in pins))
+    keys = _keys(machine, [*free, *(f"bodies.{joint}.axis" for joint in surveyed)])
     joints = [key.split(".")[1] for key in keys if key.startswith("bodies.")]
     seen = {name: rows for name, rows in detections.items() if name in machine.cameras}
     cut = _without_sensors(machine, seen)
     starts: dict[str, np.ndarray] = {}
     axes: dict[str, Axis] = {}
     for joint in joints:
+        if joint in surveyed and not any(m.body == joint for m in machine.markers.values()):
+            starts[axis_static(joint)] = _axis_in_file(machine, joint)
+            continue
         axes[joint], marker = _axis_alone(cut, site, joint, keys, seen)
-        starts[f"joint {joint} axis"] = axes[joint].T_parent_axis
+        starts[axis_static(joint)] = axes[joint].T_parent_axis
         if f"markers.{marker}.mount" in keys:
             starts[f"marker {marker} mount"] = _turned_as_in_file(machine, marker, axes[joint].T_axis_marker)
     network = _freed(network_of(_unmounted(cut, keys), site), keys, starts, cut)
@@ -105,7 +118,10 @@ def calibrate_mounts(
             f"the pictures contradict the files: corners are {whole.sigma0:.1f} times as far from where they should be "
             "as detection says; check the sizes of the tags, and that what is not freed is right; nothing was written"
         )
-    _refuse_untold(whole, keys)
+    fits: list[PinFit] = []
+    if pins:
+        whole, fits = with_pins(whole, {joint: _parent(machine, joint) for joint in surveyed}, pins)
+    _refuse_untold(whole, keys, surveyed)
     told = []
     for key in keys:
         name = static_of(key)
@@ -115,7 +131,7 @@ def calibrate_mounts(
         if joint:
             covariance = covariance + _conventions(machine, keys, joint)
         told.append(ToldPose(key, whole.value(name), covariance, old, axes.get(joint)))
-    return Mounts(whole, tuple(told), whole.warnings)
+    return Mounts(whole, tuple(told), whole.warnings, tuple(fits))
 
 
 def _keys(machine: Machine, free: Sequence[str]) -> list[str]:
@@ -223,6 +239,18 @@ def _axis_alone(machine: Machine, site: Site, joint: str, keys: Sequence[str], s
     return axis_of_motion(T, covariance, body.axis.transform(), joint), marker
 
 
+def _parent(machine: Machine, joint: str) -> str:
+    body = machine.bodies[joint]
+    assert isinstance(body, JointBody)
+    return body.parent
+
+
+def _axis_in_file(machine: Machine, joint: str) -> np.ndarray:
+    body = machine.bodies[joint]
+    assert isinstance(body, JointBody)
+    return np.asarray(body.axis.transform())
+
+
 def _index(network: Network, marker: str) -> int:
     return [m.name for m in network.markers].index(marker)
 
@@ -306,8 +334,9 @@ def _marker_is_known(machine: Machine, keys: Sequence[str], joint: str) -> bool:
     )
 
 
-def _refuse_untold(whole: Adjusted, keys: Sequence[str]) -> None:
-    names = {static_of(key): key for key in keys}
+def _refuse_untold(whole: Adjusted, keys: Sequence[str], surveyed: Sequence[str]) -> None:
+    by_shots = {axis_static(joint) for joint in surveyed}  # the pictures alone need not tell them
+    names = {static_of(key): key for key in keys if static_of(key) not in by_shots}
     for finding in whole.untold:
         if finding.kind == "in series" and set(finding.quantities) <= set(names):
             a, b = (names[q] for q in finding.quantities)

@@ -55,13 +55,19 @@ def cluster(log: Path, jobs: int | None, **options: Any) -> None:
     help="What is to be told: markers.NAME.mount, cameras.NAME.mount or bodies.NAME.axis; may be given several times. "
     "Mounts that machine.toml leaves out are told anyway.",
 )
+@click.option(
+    "--pins",
+    metavar="FILE",
+    type=FILE,
+    help="Shots of pins with their times, named after the joint that turns about them (bucket-L, bucket-R).",
+)
 @distance(3.0, "From what is told to the cutting edge, for the line that says whether it is good enough.")
 @JOBS
 def mounts(log: Path, jobs: int | None, **options: Any) -> None:
     """Tell mounts of markers and cameras, and axes of joints, from LOG, in which the machine moves.
 
     A joint's axis needs a marker on either side of it in view while it turns over its stroke; the one beyond it may be
-    held by magnets and needs no mount in machine.toml.
+    held by magnets and needs no mount in machine.toml. Or shots of both ends of its pin, with the machine standing.
     """
     from pipeline.progress import watch_on
     from pipeline.stages.calibrate_mounts import run

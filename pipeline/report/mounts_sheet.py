@@ -60,6 +60,14 @@ def mounts_sheet(
                 [_circle(t, words) for t in axes],
             )
         )
+    if mounts.pins:
+        parts.append(
+            Part(
+                words("mounts.pins"),
+                [words("mounts.pins_text")],
+                [(words("mounts.pins_caption"), _pins(mounts, words))],
+            )
+        )
     return Sheet(
         title=words("mounts.title"),
         subject=subject,
@@ -82,7 +90,7 @@ def edge_sigma_m(told: ToldPose, distance_m: float) -> float:
     axis sees it across its own line.
     """
     covariance = told.covariance
-    if told.axis is not None:
+    if told.key.startswith("bodies."):
         covariance = np.zeros((6, 6))
         at = np.ix_(TOLD, TOLD)
         covariance[at] = told.covariance[at]
@@ -136,6 +144,25 @@ def _axes(axes: list[ToldPose], words: Words) -> dict:
                 "plane": 1000 * t.axis.plane_m,
             }
         )
+    return table(columns, rows)
+
+
+def _pins(mounts: Mounts, words: Words) -> dict:
+    columns = [
+        column("shot", words("mounts.shot"), kind="code"),
+        column("joint", words("mounts.joint"), kind="code"),
+        column("off", words("mounts.off_axis"), "mm", 1),
+        column("sigmas", words("mounts.off_sigmas"), digits=1),
+    ]
+    rows = [
+        {
+            "shot": fit.shot.name,
+            "joint": fit.shot.joint,
+            "off": 1000 * fit.off_m,
+            "sigmas": fit.normalised,
+        }
+        for fit in mounts.pins
+    ]
     return table(columns, rows)
 
 

@@ -20,7 +20,7 @@ from pipeline.network import network_of
 from pipeline.report.bucket_sheet import BucketFacts
 from pipeline.stages.calibrated import provenance
 from pipeline.surface.parked import KnownPoint
-from pipeline.surface.shots import Shots, read_shots
+from pipeline.surface.shots import Shots, order_of, read_shots
 
 COMMAND = "gradetrace calibrate bucket"
 WEAR_SIGMA_M = 0.2
@@ -160,7 +160,7 @@ def points_of(
     if checks_file is not None:
         shots = read_shots(
             checks_file,
-            "named" if checks is None else _order(checks_file, checks.order),
+            "named" if checks is None else order_of(checks_file, checks.order),
             scale,
             site.report.time_zone,
             None if checks is None else checks.codes,
@@ -190,13 +190,3 @@ def points_of(
             "site.toml"
         )
     return shots, known
-
-
-def _order(file: Path, order: str) -> str:
-    """A file with headings says itself what its columns are."""
-    try:
-        first = file.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff").splitlines()[:1]
-    except OSError:
-        return order
-    words = {word.strip().lower() for word in first[0].replace(";", ",").split(",")} if first else set()
-    return "named" if {"northing", "easting"} <= words else order

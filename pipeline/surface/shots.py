@@ -109,6 +109,16 @@ def read_shots(
     return reader.shots(metres_per_unit)
 
 
+def order_of(file: Path, order: str) -> str:
+    """A file with headings says itself what its columns are."""
+    try:
+        first = file.read_text(encoding="utf-8", errors="replace").lstrip("\ufeff").splitlines()[:1]
+    except OSError:
+        return order
+    words = {word.strip().lower() for word in first[0].replace(";", ",").split(",")} if first else set()
+    return "named" if {"northing", "easting"} <= words else order
+
+
 def check_order(shots: Shots, low_en: np.ndarray, high_en: np.ndarray, order: str, source: str) -> None:
     """Raise SurfaceError where the shots lie on the design only with northing and easting exchanged.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 import json
 import multiprocessing
 from collections.abc import Callable, Iterator
@@ -28,6 +29,7 @@ from pipeline.synthetic.specification import Specification
 SLICE_FRAMES = 12
 CORNER_NAMES = ("TL", "TR", "BR", "BL")
 SIGMA_CORNER_MM = 1.0
+PIN_SHOTS_S, HALF_PIN_M = 3.0, 0.35
 
 
 def record_calibration(
@@ -70,6 +72,8 @@ def record_calibration(
         ("corners.csv", corner_shots(site)),
     ):
         (folder / file).write_text(text, encoding="utf-8", newline="\n")
+    if site.bucket_marker is not None:
+        (folder / "pins.csv").write_text(pin_shots(site), encoding="utf-8", newline="\n")
     (folder / "truth").mkdir(exist_ok=True)
     (folder / "truth" / "statics.json").write_text(
         json.dumps(truth_of(site), indent=1) + "\n", encoding="utf-8"
@@ -120,6 +124,21 @@ def corner_shots(site: CalibrationSite) -> str:
         p = p + rng.normal(size=p.shape) * SIGMA_CORNER_MM / 1000
         for name, (e, n, h) in zip(CORNER_NAMES, np.array(site.spec.origin) + p / unit, strict=True):
             lines.append(f"{plan.board.name}-{name},{n:.4f},{e:.4f},{h:.4f},tag corner")
+    return "\n".join(lines) + "\n"
+
+
+def pin_shots(site: CalibrationSite) -> str:
+    """Both ends of the bucket's pin, shot while the machine stands: PNEZD with headings and times, grid unit."""
+    rng = np.random.default_rng([site.seed, 33])
+    unit = files.METRES_PER_UNIT[site.spec.unit]
+    t = PIN_SHOTS_S * np.ones(2)
+    ends = np.array([[0.0, 0.0, -HALF_PIN_M], [0.0, 0.0, HALF_PIN_M]])
+    p = se3.transform(site.motion.poses(t).stick(site.spec) @ site.truth.axis, ends)
+    p = p + rng.normal(size=p.shape) * SIGMA_CORNER_MM / 1000
+    stamp = datetime.datetime.fromtimestamp(site.spec.start_utc_ns / 1e9 + PIN_SHOTS_S, datetime.UTC)
+    lines = ["point,northing,easting,elevation,time,sigma_mm"]
+    for name, (e, n, h) in zip("LR", np.array(site.spec.origin) + p / unit, strict=True):
+        lines.append(f"bucket-{name},{n:.4f},{e:.4f},{h:.4f},{stamp:%Y-%m-%dT%H:%M:%SZ},{SIGMA_CORNER_MM:g}")
     return "\n".join(lines) + "\n"
 
 

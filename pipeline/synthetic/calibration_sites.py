@@ -34,7 +34,8 @@ TAG_M, GAP_M = 0.45, 0.08
 STOPS_DEG = (-45.0, -32.0, -19.0, -6.0, 8.0, 21.0, 34.0, 45.0, 27.0, 14.0, 1.0, -13.0, -26.0, -38.0)
 """Where the swing stops."""
 REST_S, TURN_S = 2.0, 1.5
-WAVE_S = 48.0
+STAND_S, WAVE_S = 6.0, 48.0
+"""It stands first, while its pin is shot, and waves then."""
 BUCKET_BOARD = BoardPlan("bucket-board", 80, 2, 2, 0.20, 0.05, 0.04)
 BUCKET_MARKER = (0.45, 0.30, -0.72)
 """Centre of the bucket's board in the bucket frame."""
@@ -67,7 +68,7 @@ class Standing:
         self.lean = rng.normal(0.0, 0.004, 2)
         self.stops = np.deg2rad(np.array(STOPS_DEG) + rng.uniform(-3, 3, len(STOPS_DEG)))
         self.phase = rng.uniform(0.0, 2 * np.pi, 3)
-        self.duration_s = WAVE_S if waving else len(STOPS_DEG) * (REST_S + TURN_S)
+        self.duration_s = STAND_S + WAVE_S if waving else len(STOPS_DEG) * (REST_S + TURN_S)
 
     @property
     def heading_rad(self) -> float:
@@ -86,12 +87,15 @@ class Standing:
         position = self.place.point(self.station, 0.0, self.spec.ground - 0.02)
         T = se3.from_rotation_translation(R @ turn, np.broadcast_to(position, (len(t), 3)))
         a, b, c = self.phase
+        u = t - STAND_S
+        # From rest to its pace within a second, without a jump of acceleration.
+        w = np.where(u < 0, 0.0, np.where(u < 1, u**3 - u**4 / 2, u - 0.5))
         if not self.waving:
             stick = np.full_like(t, -75.0)
             return Poses(t, T, np.full_like(t, np.deg2rad(28.0)), np.deg2rad(stick), np.deg2rad(stick - 60.0))
-        boom = 18.5 + 4.0 * np.sin(2 * np.pi * t / 23.0 + a)
-        stick = -62.0 + 16.0 * np.sin(2 * np.pi * t / 17.0 + b)
-        joint = -72.0 + 52.0 * np.sin(2 * np.pi * t / 13.0 + c)
+        boom = 18.5 + 4.0 * np.sin(2 * np.pi * w / 23.0 + a)
+        stick = -62.0 + 16.0 * np.sin(2 * np.pi * w / 17.0 + b)
+        joint = -72.0 + 52.0 * np.sin(2 * np.pi * w / 13.0 + c)
         return Poses(t, T, np.deg2rad(boom), np.deg2rad(stick), np.deg2rad(stick + joint))
 
     def _swing(self, t: np.ndarray) -> np.ndarray:
