@@ -91,8 +91,9 @@ def corner_noise(columns: Mapping[str, np.ndarray]) -> CornerNoise:
 def one_frame_mm(noise_px: float, side_px: float, focal_px: float, distance_m: float) -> tuple[float, float]:
     """What corner noise makes of a tag's place in one frame: millimetres across the view, and along it.
 
-    A tag that faces the camera: its middle is the mean of four corners, and its size has, with corners ``s / sqrt 2``
-    from the middle, the relative standard deviation ``noise / (sqrt 2 s)``.
+    A tag that faces the camera, alone and to first order. A tilt moves its corners alike as a shift does, and shows
+    otherwise only in the keystone; so its place across the view is the mean of the corners and the keystone together,
+    either with half a corner's noise: ``noise / sqrt 2``. Its size has the relative deviation ``noise / (sqrt 2 s)``.
 
     Parameters
     ----------
@@ -105,7 +106,7 @@ def one_frame_mm(noise_px: float, side_px: float, focal_px: float, distance_m: f
     distance_m : float
         From the camera to the tag.
     """
-    across = 1000 * distance_m * noise_px / 2 / focal_px
+    across = 1000 * distance_m * noise_px / math.sqrt(2) / focal_px
     along = 1000 * distance_m * noise_px / (math.sqrt(2) * side_px)
     return across, along
 

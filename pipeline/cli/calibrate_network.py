@@ -81,7 +81,9 @@ def mounts(log: Path, jobs: int | None, **options: Any) -> None:
 @click.option("--old", "old_days", metavar="DAYS", type=click.IntRange(1), default=180, show_default=True,
               help="Age from which a calibration is named.")  # fmt: skip
 @click.option("--today", metavar="DAY", type=click.DateTime(["%Y-%m-%d"]), help="Count ages until this day.")
-def history(files: tuple[Path, ...], distance_m: float, old_days: int, today: Any) -> None:
+@click.option("--out", metavar="FILE", type=FILE, default=Path("machine-history.html"), show_default=True,
+              help="The sheet.")  # fmt: skip
+def history(files: tuple[Path, ...], distance_m: float, old_days: int, today: Any, out: Path) -> None:
     """Compare dated machine files: what moved, by how many sigmas and millimetres, and what has grown old.
 
     FILES are machine.toml and the files that earlier calibrations left beside it, machine.before-*.toml.
@@ -91,9 +93,10 @@ def history(files: tuple[Path, ...], distance_m: float, old_days: int, today: An
     from pipeline.stages.calibrate_history import run
 
     day = datetime.datetime.now(datetime.UTC).date() if today is None else today.date()
-    rows, sentences = run(files, day, distance_m, old_days)
+    rows, sentences = run(files, day, distance_m, old_days, out)
     print_table(("quantity", "calibrated", "by", "sigmas", "mm at edge", "age, days"), rows)
     for sentence in sentences:
         click.echo(f"! {sentence}")
     if not sentences:
         click.echo("nothing moved by more than chance, and nothing is old")
+    click.echo(f"sheet: {out}")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -10,22 +11,34 @@ from pipeline.calibration.drift import Change, history
 from pipeline.config import load_machine
 from pipeline.config.document import decode, read_file
 from pipeline.errors import CalibrationError
+from pipeline.report.history_sheet import history_sheet
+from pipeline.stages.calibrated import put_sheet
 
 MOVED_SIGMAS = 3.0
 OLD_DAYS = 180
 
 
 def run(
-    files: Sequence[Path], today: datetime.date, distance_m: float, old_days: int = OLD_DAYS
+    files: Sequence[Path],
+    today: datetime.date,
+    distance_m: float,
+    old_days: int = OLD_DAYS,
+    page: Path | None = None,
 ) -> tuple[list[tuple[str, ...]], list[str]]:
     """Rows of a table (quantity, date, by, sigmas, mm at the edge, age) and sentences about what needs attention.
+
+    The sheet goes to `page`, where one is named.
 
     Raises
     ------
     PipelineError
         A file cannot be read, or they are of different machines.
     """
-    machines = [load_machine(decode(read_file(file), str(file)), str(file)) for file in _oldest_first(files)]
+    ordered = _oldest_first(files)
+    texts = [read_file(file) for file in ordered]
+    machines = [
+        load_machine(decode(text, str(file)), str(file)) for text, file in zip(texts, ordered, strict=True)
+    ]
     if len({m.machine.id for m in machines}) > 1:
         raise CalibrationError(
             "the files are of different machines: " + ", ".join(sorted({m.machine.id for m in machines}))
@@ -49,6 +62,15 @@ def run(
     undated = [key for key, changes in found.items() if changes[-1].date is None]
     if undated:
         sentences.append(f"of {', '.join(undated)} the file does not say when it was calibrated")
+    if page is not None:
+        origin = {
+            f.name: f"sha256 {hashlib.sha256(text).hexdigest()[:12]}"
+            for f, text in zip(ordered, texts, strict=True)
+        }
+        machine = machines[-1].machine
+        put_sheet(
+            history_sheet(found, sentences, distance_m, today, machine.name or machine.id, origin), page
+        )
     return rows, sentences
 
 

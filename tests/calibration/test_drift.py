@@ -1,6 +1,7 @@
 """Machine files by date: what moved is told in sigmas and millimetres."""
 
 import datetime
+import json
 
 import numpy as np
 import pytest
@@ -59,12 +60,22 @@ def test_the_stage_orders_files_and_names_what_moved_and_what_is_old(tmp_path):
     names = ("machine.before-2025-11-30-1.toml", "machine.before-2025-11-30-2.toml", "machine.toml")
     for name, text in zip(names, texts(), strict=True):
         (tmp_path / name).write_text(text, encoding="utf-8")
-    rows, sentences = calibrate_history.run([tmp_path / n for n in reversed(names)], TODAY, 8.0, 30)
+    page = tmp_path / "history.html"
+    rows, sentences = calibrate_history.run([tmp_path / n for n in reversed(names)], TODAY, 8.0, 30, page)
     mine = [row for row in rows if row[0] == "cameras.arm.mount"]
     assert [row[1] for row in mine] == ["2025-06-01", "2025-12-01", "2026-05-01"]
     assert mine[2][3:] == ("5.8", "27.9", "31")
     assert any("cameras.arm.mount moved by 5.8 sigma, 27.9 mm at the cutting edge" in s for s in sentences)
     assert any("cameras.arm.mount was calibrated 31 days ago (limit 30)" in s for s in sentences)
+    sheet = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
+    assert sheet["state"] == "poor" and sheet["remarks"] == sentences
+    (shown,) = (t["table"]["rows"] for part in sheet["parts"] for t in part["tables"])
+    assert [r["edge"] for r in shown if r["key"] == "cameras.arm.mount"] == [
+        None,
+        3.0,
+        pytest.approx(27.925, abs=1e-3),
+    ]
+    assert "27.9" in page.read_text(encoding="utf-8")
 
 
 def test_files_of_two_machines_are_refused(tmp_path):
