@@ -1,6 +1,6 @@
 """Calibrated values put into a TOML file that a person wrote: comments, order and every other value stay.
 
-tomlkit keeps the text as it is; what is set is written in place of the old value, or at the end of its table.
+tomlkit keeps the text as it is; what is set is written in place of the old value, or behind the last of its table.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import tomlkit
 from tomlkit.exceptions import TOMLKitError
-from tomlkit.items import InlineTable, Table
+from tomlkit.items import Comment, InlineTable, Table, Whitespace
 
 from pipeline.errors import ConfigError
 
@@ -86,7 +86,20 @@ def _put(table: Any, key: str, value: Any) -> None:
         inline = tomlkit.inline_table()
         inline.update(written)
         written = inline
+    _append(table, key, written)
+
+
+def _append(table: Any, key: str, written: Any) -> None:
+    """A value at the end of what stands in its table: before blank lines and comments, which announce the next one."""
+    announcing = []
+    if key not in table and isinstance(table, Table):
+        body = table.value.body
+        while body and body[-1][0] is None:
+            announcing.append(body.pop()[1])
     table[key] = written
+    for item in reversed(announcing):
+        if isinstance(item, Comment | Whitespace):  # else what a deleted key left
+            table.add(item)
 
 
 def _plain(value: Any) -> Any:

@@ -49,3 +49,22 @@ def test_what_is_no_table_is_refused():
         with_values("[a]\nb = 1\n", "x.toml", {"a.b.c": 2})
     with pytest.raises(ConfigError, match="not valid TOML"):
         with_values("[a\n", "x.toml", {"a.b": 2})
+
+
+def test_a_new_key_stays_before_the_comment_that_announces_the_next_table():
+    text = "[a]\nx = 1  # one\n\n# What follows.\n[b]\nz = 3\n\n# End.\n"
+    changed = with_values(text, "x.toml", {"a.y": 2, "b.w": {"k": [1]}, "a.v": 5})
+    assert changed == (
+        "[a]\nx = 1  # one\ny = 2\nv = 5\n\n# What follows.\n[b]\nz = 3\nw = {k = [1]}\n\n# End.\n"
+    )
+
+
+def test_a_covariance_that_replaces_sigmas_stands_in_its_own_table():
+    text = SAMPLE.read_text()
+    lens = {"width": 640, "height": 480, "fx": 850.0, "fy": 850.0, "cx": 320.0, "cy": 240.0,
+            "distortion": [0.0] * 5, "covariance": np.eye(9), "calibrated": {"by": "test"}}  # fmt: skip
+    lines = with_values(text, "machine.toml", {"cameras.arm.intrinsics": lens}).splitlines()
+    heading = lines.index("[cameras.arm.intrinsics]")
+    end = next(k for k in range(heading, len(lines)) if not lines[k].strip())
+    assert any(line.startswith("covariance") for line in lines[heading:end])
+    assert any(line.startswith("calibrated") for line in lines[heading:end])
