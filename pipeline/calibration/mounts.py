@@ -15,7 +15,8 @@ import numpy as np
 from pipeline.calibration.adjusted import Adjusted, adjusted
 from pipeline.calibration.axes import TOLD, Axis, axis_of_motion
 from pipeline.calibration.cluster import EXACT, WRONG_SIGMA0
-from pipeline.calibration.pins import PinFit, PinShot, axis_static, with_pins
+from pipeline.calibration.held_points import PointFit
+from pipeline.calibration.pins import PinShot, axis_static, with_pins
 from pipeline.config import Machine, Site
 from pipeline.config.machine import CuttingEdge, JointBody, MovingBody
 from pipeline.errors import CalibrationError
@@ -52,7 +53,7 @@ class Mounts:
     whole: Adjusted
     told: tuple[ToldPose, ...]
     warnings: tuple[str, ...]
-    pins: tuple[PinFit, ...] = ()
+    pins: tuple[PointFit, ...] = ()
     """Shots of pins, where there were any."""
 
 
@@ -118,7 +119,7 @@ def calibrate_mounts(
             f"the pictures contradict the files: corners are {whole.sigma0:.1f} times as far from where they should be "
             "as detection says; check the sizes of the tags, and that what is not freed is right; nothing was written"
         )
-    fits: list[PinFit] = []
+    fits: list[PointFit] = []
     if pins:
         whole, fits = with_pins(whole, {joint: _parent(machine, joint) for joint in surveyed}, pins)
     _refuse_untold(whole, keys, surveyed)

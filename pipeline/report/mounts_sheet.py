@@ -150,14 +150,12 @@ def _axes(axes: list[ToldPose], words: Words) -> dict:
 def _pins(mounts: Mounts, words: Words) -> dict:
     columns = [
         column("shot", words("mounts.shot"), kind="code"),
-        column("joint", words("mounts.joint"), kind="code"),
         column("off", words("mounts.off_axis"), "mm", 1),
         column("sigmas", words("mounts.off_sigmas"), digits=1),
     ]
     rows = [
         {
-            "shot": fit.shot.name,
-            "joint": fit.shot.joint,
+            "shot": fit.name,
             "off": 1000 * fit.off_m,
             "sigmas": fit.normalised,
         }

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.calibration import curve_fit
+from pipeline.calibration.belt import ToldBelt
 from pipeline.calibration.touches import Rig
 from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody
@@ -18,7 +19,7 @@ from pipeline.errors import CalibrationError
 from pipeline.geometry import so3
 from pipeline.network import network_of
 from pipeline.report.bucket_sheet import BucketFacts
-from pipeline.stages.calibrated import provenance
+from pipeline.stages.calibrated import pose_table, provenance
 from pipeline.surface.parked import KnownPoint
 from pipeline.surface.shots import Shots, order_of, read_shots
 
@@ -88,6 +89,21 @@ def values_of(
         values[f"sensors.{name}.linkage.sigma_horn_angle_deg"] = 0.0
     if machine.cutting_edge.wear:
         values["cutting_edge.wear"] = None  # what was touched with were the teeth as they are now
+    return values
+
+
+def belt_values(machine: Machine, told: ToldBelt, stamp: dict[str, Any]) -> dict[str, Any]:
+    """Dotted keys and values for machine.toml of a belt: its phase, the edge, and the bucket's zero held."""
+    joint = machine.cutting_edge.body
+    body = machine.bodies[joint]
+    assert isinstance(body, JointBody)
+    values: dict[str, Any] = {
+        f"bodies.{told.joint}.axis": pose_table(told.T_parent_axis, told.axis, stamp),
+        f"bodies.{joint}.axis": _without_turn(body.axis),
+        "cutting_edge.mount": pose_table(told.T_bucket_tool, told.tool, stamp),
+    }
+    if machine.cutting_edge.wear:
+        values["cutting_edge.wear"] = None
     return values
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.calibration.agreement import agreed, kept_of
+from pipeline.calibration.belt import belt_on
 from pipeline.calibration.standings import RULE, Touched, machine_to_the_pin, standings, touched
 from pipeline.calibration.touches import TOOL
 from pipeline.config import Machine, Site
@@ -17,11 +18,11 @@ from pipeline.estimation.table import sensitivities_from_columns
 from pipeline.report.bucket_sheet import BucketFacts, bucket_sheet
 from pipeline.report.sheet import SHARE
 from pipeline.runs import RunFolder
-from pipeline.stages import stage_named
+from pipeline.stages import calibrate_belt, stage_named
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
 from pipeline.stages.calibrated import Written, put_into, put_sheet
 from pipeline.stages.calibration_log import machine_to_write
-from pipeline.stages.job import Job, open_log
+from pipeline.stages.job import Job, check_log_file, describe, open_log
 from pipeline.stages.runner import Watch, run_if_stale
 from pipeline.surface.rests import rests_of
 from pipeline.tracks.table import cutting_edge_from_columns, states_from_columns
@@ -58,6 +59,22 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Written:
     PipelineError
         The log, a description or a stage is at fault.
     """
+    check_log_file(wanted.log)
+    machine = describe(wanted.log, wanted.machine, wanted.site)[0]
+    if (belt := belt_to_calibrate(machine, wanted)) is not None:
+        return calibrate_belt.run(
+            wanted.log,
+            wanted.checks,
+            wanted.machine,
+            wanted.site,
+            wanted.runs,
+            wanted.workers,
+            watch,
+            belt,
+            wanted.point,
+            wanted.tooth,
+            wanted.contact_mm / 1000,
+        )
     # Of its own: in runs/<log> the tables are those of the whole machine.
     folder = RunFolder(wanted.runs / f"{wanted.log.stem}-bucket")
     job = open_log(wanted.log, wanted.machine, wanted.site, folder, wanted.workers, create_folder=True)
@@ -98,6 +115,19 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Written:
         put_sheet(sheet, page)
         before = put_into(machine_file, "machine", values)
     return Written(sheet.sentence, tuple(sheet.remarks), page, machine_file, before)
+
+
+def belt_to_calibrate(machine: Machine, wanted: Wanted) -> str | None:
+    """The belt that shows the bucket's angle where no sensor reads it. Raises CalibrationError with `--wear`."""
+    joint = machine.cutting_edge.body
+    read = any(sensor.joint == joint for sensor in machine.sensors.values())
+    belt = None if read or wanted.sensor is not None else belt_on(machine, joint)
+    if belt is not None and wanted.wear:
+        raise CalibrationError(
+            f"'{belt}' shows the bucket's angle by a belt, and --wear holds a sensor's curve; leave it out: the edge "
+            "is told along with the belt"
+        )
+    return belt
 
 
 def sensor_of(machine: Machine, asked: str | None) -> str:

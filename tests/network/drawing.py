@@ -28,7 +28,8 @@ class Course:
     """How a body goes about: a pose in the world and how far it sways, or a joint's angle and how far it turns."""
 
     centre: object
-    """Moving or static: x, y, z in the world, and optionally roll, pitch, yaw. Joint: degrees."""
+    """Moving or static: x, y, z in the world, and optionally roll, pitch, yaw. Joint: degrees, or radians as a function
+    of seconds (n,)."""
     sway: tuple[float, float] = (0.0, 0.0)
     """Metres and degrees; of a joint the second."""
 
@@ -167,7 +168,7 @@ def _pose(xyz, rpy_deg):
 
 def _waves(rng, course: Course):
     """Poses or angles of a body as a function of time: three sines with periods of 9 to 25 s on each coordinate."""
-    joint = np.isscalar(course.centre)
+    joint = np.isscalar(course.centre) or callable(course.centre)
     count = 1 if joint else 6
     speed = 2 * np.pi / rng.uniform(9.0, 25.0, (3, count))
     phase = rng.uniform(0, 2 * np.pi, (3, count))
@@ -175,6 +176,8 @@ def _waves(rng, course: Course):
     def swayed(t):
         return np.sum(np.sin(np.multiply.outer(t, speed) + phase), axis=1) / np.sqrt(3.0)
 
+    if callable(course.centre):
+        return course.centre
     if joint:
         return lambda t: np.deg2rad(course.centre + course.sway[1] * swayed(t)[:, 0])
     at = list(course.centre) + [0.0] * (6 - len(course.centre))
