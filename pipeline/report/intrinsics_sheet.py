@@ -74,7 +74,7 @@ def intrinsics_sheet(
             w("lens"),
             [
                 w(f"model_{found.lens.name}"),
-                w("bend", x=f"{1000 * solution.bend_m[0]:.2f}", y=f"{1000 * solution.bend_m[1]:.2f}"),
+                w("bend", x=text_of(1000 * solution.bend_m[0], 2), y=text_of(1000 * solution.bend_m[1], 2)),
                 *([w("shared", factor=f"{solution.shared_factor**0.5:.1f}")] if solution.shared_factor > 1 else []),
             ],
             tables=[(w("parameters", width=found.size[0], height=found.size[1]), table(columns, rows))],
