@@ -37,6 +37,12 @@ def keep_result(name: str, rows: list[Any], line: str) -> None:
     )
 
 
+def kept_rows(name: str) -> list[dict[str, Any]]:
+    """Rows of the last run that was kept; none where there is none."""
+    file = FOLDER / f"{name}.json"
+    return json.loads(file.read_text(encoding="utf-8"))["rows"] if file.is_file() else []
+
+
 def _plain(value: Any) -> Any:
     """JSON has no NaN: null where there is no figure."""
     if isinstance(value, dict):
