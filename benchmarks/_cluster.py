@@ -143,6 +143,22 @@ def _print(name: str, tag_m: float, ids: tuple[int, ...]) -> tuple[np.ndarray, f
     return scenery.board_texture(board_of(network(at), name), np.random.default_rng(8))
 
 
+def _outline(board: Board, T_camera_marker, intrinsics) -> tuple[int, int, int, int]:
+    """Columns and rows, from and to, of the rectangle that holds a board."""
+    R, p = T_camera_marker[:3, :3], T_camera_marker[:3, 3]
+    w, h = board.size
+    rim = p + 0.5 * np.array([[-w, h], [w, h], [w, -h], [-w, -h]]) @ R[:, :2].T
+    uv = pixels(rim, intrinsics)
+    (u0, v0), (u1, v1) = np.floor(uv.min(0)).astype(int) - 4, np.ceil(uv.max(0)).astype(int) + 5
+    return int(u0), int(v0), int(u1), int(v1)
+
+
+def in_view(board: Board, T_camera_marker, intrinsics) -> bool:
+    """Whether the whole board is in the picture."""
+    u0, v0, u1, v1 = _outline(board, T_camera_marker, intrinsics)
+    return u0 >= 0 and v0 >= 0 and u1 < WIDTH and v1 < HEIGHT
+
+
 def rendered(board: Board, T_camera_marker, intrinsics, rng: np.random.Generator) -> np.ndarray:
     """(H, W) uint8: a board before some texture, through a lens, with noise and JPEG."""
     light = np.roll(background(), rng.integers(0, 400, 2), axis=(0, 1))
@@ -153,11 +169,7 @@ def rendered(board: Board, T_camera_marker, intrinsics, rng: np.random.Generator
     )
     H = to_texel @ np.linalg.inv(np.stack([R[:, 0], R[:, 1], p], axis=-1))
     # Only where the board is, with some rays in each pixel.
-    w, h = board.size
-    rim = p + 0.5 * np.array([[-w, h], [w, h], [w, -h], [-w, -h]]) @ R[:, :2].T
-    uv = pixels(rim, intrinsics)
-    (u0, v0), (u1, v1) = np.floor(uv.min(0)).astype(int) - 4, np.ceil(uv.max(0)).astype(int) + 5
-    assert u0 >= 0 and v0 >= 0 and u1 < WIDTH and v1 < HEIGHT, "the board is outside the picture"
+    u0, v0, u1, v1 = _outline(board, T_camera_marker, intrinsics)
     cut = np.array(intrinsics)
     cut[2:4] -= u0, v0
     cut[:2] *= SUPERSAMPLE
@@ -184,6 +196,10 @@ def rendered(board: Board, T_camera_marker, intrinsics, rng: np.random.Generator
     return compress(grey, QUALITY)
 
 
+SET_UPS = 100
+"""Of which one at least has both boards in view."""
+
+
 @dataclass(frozen=True)
 class Depth:
     """One trial; metres."""
@@ -198,14 +214,21 @@ def trial(at: Arrangement, finder: TagFinder, rng: np.random.Generator) -> Depth
     """One arrangement drawn, rendered, detected and adjusted."""
     net = network(at)
     truth = {s.name: true_static(rng, s) for s in net.statics}
-    T_cab = se3.exp(np.r_[rng.uniform(-0.1, 0.1, 3), rng.normal(0, 0.02, 3)])
-    T_plate = plate(at, rng)
+    # Whoever sets this up sees to it that both boards are in the pictures.
+    for _ in range(SET_UPS):
+        T_cab = se3.exp(np.r_[rng.uniform(-0.1, 0.1, 3), rng.normal(0, 0.02, 3)])
+        T_plate = plate(at, rng)
+        markers = {"B": truth["benchmark B pose"], "plate": T_plate}
+        views = [
+            (board_of(net, name), se3.inverse(T_cab @ truth[f"camera {camera} mount"]) @ markers[name],
+             truth[f"camera {camera} intrinsics"])
+            for camera, name in (("bench", "B"), ("arm", "plate"))
+        ]  # fmt: skip
+        if all(in_view(*view) for view in views):
+            break
     rows, known = [], {FAMILY: set(net.tag_id.tolist())}
-    for c, (camera, name) in enumerate((("bench", "B"), ("arm", "plate"))):
-        T_camera = T_cab @ truth[f"camera {camera} mount"]
-        T_marker = T_plate if name == "plate" else truth["benchmark B pose"]
-        intrinsics = truth[f"camera {camera} intrinsics"]
-        grey = rendered(board_of(net, name), se3.inverse(T_camera) @ T_marker, intrinsics, rng)
+    for c, view in enumerate(views):
+        grey = rendered(*view, rng)
         seen = search(grey, finder, Refiner(net.statics[net.cameras[c].intrinsics].value))
         accepted = judge(seen, known, DetectionSettings()) == ACCEPTED
         for k in np.flatnonzero(accepted):

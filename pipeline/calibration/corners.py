@@ -29,6 +29,8 @@ WINDOW = 0.35
 FLOOR_PX = 0.01
 """Standard deviation that no corner is better than: what resampling and compression leave."""
 KEPT_FAILURES = 3
+SHARE_OFF = 0.1
+"""By which a tag's share of its square may seem other than said: one pixel at either end of a tag of 20 px."""
 _SUBPIX = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-4)
 _CHESS = cv2.CALIB_CB_NORMALIZE_IMAGE
 
@@ -51,6 +53,8 @@ class CornerFinder:
         """Tags of the board's family that were seen."""
         self._views: list[View] = []
         self._failures: list[np.ndarray] = []
+        self._shares: list[float] = []
+        """Side of a tag over that of its square, as each picture shows it."""
         self._pattern: list[Counter[int]] = [Counter(), Counter()]
         if board.kind == CHARUCO:
             self._charuco = [_charuco_detector(board, legacy) for legacy in (False, True)]
@@ -97,6 +101,21 @@ class CornerFinder:
             f"tags {ids[0]} to {ids[-1]} of {self.board.family} are in view, the board has {first} to {last}"
         )
 
+    def misprint(self) -> str:
+        """What the print shows to be other than said; empty where nothing is.
+
+        How large a ChArUco board is no picture tells, but how large its tags are beside its squares: with a wrong share
+        OpenCV looks for the corners beside where they are.
+        """
+        said = self.board.second_m / self.board.square_m
+        share = float(np.median(self._shares)) if self._shares else said
+        if abs(share / said - 1) <= SHARE_OFF:
+            return ""
+        return (
+            f"its tags measure {share:.2f} of a square in the pictures, and {said:.2f} by the board {self.board.text}; "
+            "measure the sides of a square and of a tag"
+        )
+
     def _chessboard(self, name: str, grey: np.ndarray) -> View | None:
         size = (self.board.columns, self.board.rows)
         halved = max(grey.shape) > SEARCH_PX
@@ -114,7 +133,7 @@ class CornerFinder:
         sure = abs(self._pattern[0].total() - self._pattern[1].total()) > 200
         tries = [0, 1] if not sure else [int(self._pattern[1].total() > self._pattern[0].total())]
         for which in tries:
-            corners, ids, _, tags = self._charuco[which].detectBoard(grey)
+            corners, ids, around, tags = self._charuco[which].detectBoard(grey)
             if which == tries[0] and tags is not None:
                 self.ids.update(int(tag) for tag in np.ravel(tags))
             if ids is None or not len(ids):
@@ -122,11 +141,15 @@ class CornerFinder:
             self._pattern[which].update(int(number) for number in np.ravel(ids))
             if best is None or len(ids) > len(best[0]):
                 best = np.ravel(ids), corners.reshape(-1, 2).astype(float)
+                outlines = np.reshape(around, (-1, 4, 2)).astype(float)
         if best is None or len(best[0]) < LEAST_CORNERS:
             return None
         # The window must not reach into the tags, whose own edges would pull.
         window = min(WINDOW, 0.5 * (1 - self.board.second_m / self.board.square_m))
-        return _refined(name, grey, best[0], best[1], self.board, window)
+        view = _refined(name, grey, best[0], best[1], self.board, window)
+        if view is not None:
+            self._shares.append(_tag_share(self.board, view, outlines))
+        return view
 
     def _grid(self, name: str, grey: np.ndarray) -> View | None:
         found = self._tags.find(grey)
@@ -147,6 +170,15 @@ class CornerFinder:
         tag = found.tag_id[once][good] - self.board.first_id
         cov = refined.cov[good] + FLOOR_PX**2 * np.eye(8)
         return View(name, 4 * tag[:, None] + np.arange(4), refined.uv[good], cov)
+
+
+def _tag_share(board: CalibrationBoard, view: View, outlines: np.ndarray) -> float:
+    """Side of a tag over that of its square: outlines (n, 4, 2) px laid onto the print by the view's corners."""
+    H = homography.from_points(view.uv[:, 0], board.corners_m[view.point[:, 0]][:, :2])
+    q = np.concatenate([outlines, np.ones((*outlines.shape[:2], 1))], axis=-1) @ H.T
+    on_print = q[..., :2] / q[..., 2:]
+    sides = np.linalg.norm(on_print - np.roll(on_print, 1, axis=1), axis=-1)
+    return float(np.median(sides)) / board.square_m
 
 
 def _charuco_detector(board: CalibrationBoard, legacy: bool) -> cv2.aruco.CharucoDetector:

@@ -58,7 +58,7 @@ def cluster(log: Path, jobs: int | None, **options: Any) -> None:
 @click.option(
     "--pins",
     metavar="FILE",
-    type=FILE,
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
     help="Shots of pins with their times, named after the joint that turns about them (bucket-L, bucket-R).",
 )
 @distance(3.0, "From what is told to the cutting edge, for the line that says whether it is good enough.")

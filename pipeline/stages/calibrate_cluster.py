@@ -25,7 +25,7 @@ from pipeline.stages.calibrated import (
 from pipeline.stages.calibration_log import CalibrationLog, searched
 from pipeline.stages.runner import Watch
 
-COMMAND = "calibrate cluster"
+COMMAND = "gradetrace calibrate cluster"
 
 
 def run(

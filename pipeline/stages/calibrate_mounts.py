@@ -19,7 +19,7 @@ from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 from pipeline.surface.shots import NO_TIME, order_of, read_shots
 
-COMMAND = "calibrate mounts"
+COMMAND = "gradetrace calibrate mounts"
 
 
 def run(

@@ -134,6 +134,8 @@ def calibrate_intrinsics(
             raise CalibrationError(
                 f"{source}: the board {printed.text} is in none of {finder.pictures} pictures; {seen}; correct --board"
             )
+        if wrong := finder.misprint():
+            raise CalibrationError(f"{source}: {wrong}, and correct --board")
         views, searched, date = finder.views(), finder.pictures, pictures.date
     found = calibrate_lens(lens, views, printed, size, distance_m)
     sha256 = _hash_of(source)

@@ -21,7 +21,7 @@ from pipeline.report.survey_sheet import survey_sheet
 from pipeline.stages.calibrated import Written, demand_of, provenance, put_into, put_sheet, written_covariance
 from pipeline.surface.shots import Shots, read_shots
 
-COMMAND = "survey"
+COMMAND = "gradetrace survey"
 _CORNER = re.compile(r"(?:(?P<tag>\d+)[-_./ :])?(?P<corner>TL|TR|BR|BL|[0-3])", re.IGNORECASE)
 _OUTER = np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
 

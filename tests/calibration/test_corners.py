@@ -111,3 +111,12 @@ def test_a_grid_of_tags_is_laid_out_as_it_is_printed(upwards, turned):
     assert np.allclose(np.abs(np.linalg.det(x[:2])), 1e6, rtol=1e-3)
     assert np.linalg.det(x[:2]) > 0, "a mirrored board"
     assert uv.min(axis=0) == pytest.approx([59.5, 49.5], abs=0.05)
+
+
+def test_tags_of_another_share_of_their_square_than_said_are_told():
+    waved = WavedBoard(CHARUCO, LENS, SIZE, 4)
+    for square, said in ((0.08, ""), (0.07, "its tags measure 0.7")):
+        finder = CornerFinder(parse_board(f"charuco:9x6:{square}:0.06:{CHARUCO.dictionary}"))
+        for index, T in enumerate(waved.poses(6)):
+            finder.add(str(index), waved.picture(index, T))
+        assert finder.misprint().startswith(said) and bool(finder.misprint()) == bool(said)
