@@ -33,9 +33,12 @@ def curves(x, series: Sequence[tuple[str, np.ndarray]], x_label: str) -> Figure:
         )
     # The page draws no mathematics: powers of ten as plain numbers, at places of our own.
     places = np.asarray(x)[:: max(len(x) // 6, 1)]
-    ax.set_xticks(places, [f"{p:.3g}" for p in places])
+    ax.set_xticks(places, [f"{p:.0f}" if p >= 100 else f"{p:.1f}" for p in places])
+    drawn = np.concatenate([np.ravel(y) for _, y in series])
+    steps = np.outer(10.0 ** np.arange(-3, 4), [1, 2, 5]).ravel()
+    steps = steps[(steps >= 0.9 * drawn.min()) & (steps <= 1.1 * drawn.max())]
+    ax.set_yticks(steps, [f"{step:g}" for step in steps])
     ax.minorticks_off()
-    ax.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     ax.set_xlabel(x_label)
     ax.set_ylabel("sigma, mm")
     ax.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0))
