@@ -33,7 +33,7 @@ def test_poses_with_covariance_stand_in_the_site_file_and_lie_within_it(yard):
     z = []
     for name, T in drawn.truth.benchmarks.items():
         pose = found.benchmark_pose(name)
-        assert found.benchmarks[name].pose.calibrated.by == "survey"
+        assert found.benchmarks[name].pose.calibrated.by == "gradetrace survey"
         error = se3.local(pose.transform(), T)
         z.append(error @ np.linalg.solve(pose.covariance_xi(), error))
     # Nine chi-squares of six: mean 6, sigma 1.2.
