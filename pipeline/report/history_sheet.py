@@ -62,6 +62,7 @@ def history_sheet(
         subject=subject,
         state=state,
         sentence=words(f"history.{state}", count=str(len(sentences))),
+        stamp=words(f"history.stamp_{state}"),
         numbers=numbers,
         remarks=list(sentences),
         parts=[

@@ -94,6 +94,8 @@ class Sheet:
     """GOOD, POOR or OPEN."""
     sentence: str
     """Whether it is good enough, in one line, in millimetres at the cutting edge."""
+    stamp: str = ""
+    """Its shortest form; left out, "Good enough" and the like, by the state."""
     numbers: Sequence[tuple[str, Number, str]] = ()
     """Label, number, note; six at most."""
     remarks: Sequence[str] = ()
@@ -144,7 +146,7 @@ def render_sheet(sheet: Sheet, language: str = "en") -> tuple[str, dict[str, Any
         "title": sheet.title,
         "subject": sheet.subject,
         "state": sheet.state,
-        "word": words(f"sheet.{sheet.state}"),
+        "word": sheet.stamp or words(f"sheet.{sheet.state}"),
         "symbol": {GOOD: "✓", POOR: "✗", OPEN: "?"}[sheet.state],
         "style": {GOOD: "pass", POOR: "fail", OPEN: "cannot-tell"}[sheet.state],
         "sentence": sheet.sentence,

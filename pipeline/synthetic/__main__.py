@@ -61,14 +61,15 @@ def main(arguments: list[str] | None = None) -> None:
 
 def _make(jobs: int, **what) -> None:
     begun = time.monotonic()
-    first: list[float] = []
+    since: list[float] = []  # of each log the first frame
 
     def progress(done: int, of: int) -> None:
-        first.append(time.monotonic())
+        if done == 1:
+            since.append(time.monotonic())
         if done == of or (done % 10 == 0 and sys.stderr.isatty()):
-            rate = (done - 1) / max(time.monotonic() - first[0], 1e-9)
+            rate = (done - 1) / max(time.monotonic() - since[-1], 1e-9)
             end = "\n" if done == of else "\r"
-            sys.stderr.write(f"frames {done}/{of}, {rate:.1f} per second   {end}")
+            sys.stderr.write(f"log {len(since)}: frames {done}/{of}, {rate:.1f} per second   {end}")
             sys.stderr.flush()
 
     path = command.make(jobs=jobs, progress=progress, **what)

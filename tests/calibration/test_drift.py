@@ -68,7 +68,7 @@ def test_the_stage_orders_files_and_names_what_moved_and_what_is_old(tmp_path):
     assert any("cameras.arm.mount moved by 5.8 sigma, 27.9 mm at the cutting edge" in s for s in sentences)
     assert any("cameras.arm.mount was calibrated 31 days ago (limit 30)" in s for s in sentences)
     sheet = json.loads(page.with_suffix(".json").read_text(encoding="utf-8"))
-    assert sheet["state"] == "poor" and sheet["remarks"] == sentences
+    assert sheet["word"] == "Needs attention" and sheet["remarks"] == sentences
     (shown,) = (t["table"]["rows"] for part in sheet["parts"] for t in part["tables"])
     assert [r["edge"] for r in shown if r["key"] == "cameras.arm.mount"] == [
         None,
