@@ -94,8 +94,6 @@ class Sheet:
     """GOOD, POOR or OPEN."""
     sentence: str
     """Whether it is good enough, in one line, in millimetres at the cutting edge."""
-    stamp: str = ""
-    """Its shortest form; left out, "Good enough" and the like, by the state."""
     numbers: Sequence[tuple[str, Number, str]] = ()
     """Label, number, note; six at most."""
     remarks: Sequence[str] = ()
@@ -104,6 +102,8 @@ class Sheet:
     origin: Mapping[str, str] = field(default_factory=dict)
     """What it was made from: label -> text; files with their hashes, dates of recordings. No paths, no day of making:
     the same input gives the same bytes."""
+    stamp: str = ""
+    """The sentence's shortest form; left out, "Good enough" and the like, by the state."""
 
 
 def render_sheet(sheet: Sheet, language: str = "en") -> tuple[str, dict[str, Any]]:
