@@ -18,8 +18,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.calibration.adjusted import Adjusted, adjusted
+from pipeline.calibration.contradiction import refuse_contradiction
 from pipeline.calibration.curve_fit import azimuth_of
-from pipeline.calibration.held_points import PointFit, Residual, held_point, with_points
+from pipeline.calibration.held_points import PointFits, Residual, held_point, with_points
 from pipeline.calibration.pins import axis_static
 from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody
@@ -32,7 +33,9 @@ from pipeline.network.model import Network
 LEAST_TOUCHES = 3
 PHASE_RAD = np.deg2rad(20.0)
 """Prior of the phase about what the file says."""
-RESTARTS = 3
+MOST_MOVED = 3.0
+"""Times its prior, beyond which the file describes another belt."""
+RESTARTS = 6
 """A phase that is off by degrees moves the edge on a circle: the log is adjusted again from where it was found."""
 MOVED_RAD = np.deg2rad(0.02)
 
@@ -71,7 +74,7 @@ class ToldBelt:
     """(6, 6), nothing across the line from the pin."""
     edge_sigma_m: float
     """Of the middle of the edge in the bucket's plane, as seen from the pin, in its worst direction."""
-    fits: tuple[PointFit, ...]
+    fits: PointFits
     whole: Adjusted
 
     @property
@@ -116,7 +119,7 @@ def calibrate_belt(
     Raises
     ------
     CalibrationError
-        Too few touches, the machine moved, or a touch contradicts the others.
+        Too few touches, the machine moved, a touch contradicts the others, or all of them what the files say.
     """
     from pipeline.estimation.table import observations_of
 
@@ -135,16 +138,38 @@ def calibrate_belt(
     for _ in range(RESTARTS):
         whole = adjusted(network, observations, settings=site.estimation)
         told, fits = with_points(whole, _held(whole, touches), list(known.values()))
-        before, now = (w.value(axis_static(belt)) for w in (whole, told))
-        network = _from(network, told, belt)
-        if np.abs(se3.local(before, now)[5]) < MOVED_RAD:
+        turn = _turned(network, told, belt)
+        network = _from(network, belt, turn)
+        if abs(turn) < MOVED_RAD:
             break
-    worst = max(fits, key=lambda fit: fit.normalised)
-    if worst.wrong:
+    else:
         raise CalibrationError(
-            f"touch '{worst.name}' does not go with the others: {1000 * worst.off_m:.0f} mm off "
-            f"({worst.normalised:.0f} sigma); check how it was typed, or that the edge did not slip, and mend or "
+            f"the phase of '{belt}' finds no end: it still moves by {np.rad2deg(abs(turn)):.2g} deg; bring the turn of "
+            f"bodies.{belt}.axis about its z within {np.rad2deg(PHASE_RAD):.0f} deg of how the belt is on; nothing was "
+            "written"
+        )
+    refuse_contradiction(whole)
+    moved = float(
+        se3.local(first.statics[told.index(axis_static(belt))].value, told.value(axis_static(belt)))[5]
+    )
+    if abs(moved) > MOST_MOVED * PHASE_RAD:
+        raise CalibrationError(
+            f"the phase of '{belt}' is {np.rad2deg(abs(moved)):.0f} deg from where machine.toml has it: bring "
+            f"bodies.{belt}.axis within {np.rad2deg(PHASE_RAD):.0f} deg, or see whether its marker is upside down; "
+            "nothing was written"
+        )
+    off = fits.culprit
+    if off is not None:
+        raise CalibrationError(
+            f"touch '{off.name}' does not go with the others: {1000 * off.off_m:.0f} mm off "
+            f"({off.normalised:.0f} sigma); check how it was typed, or that the edge did not slip, and mend or "
             "delete its row; nothing was written"
+        )
+    if fits.wrong:
+        raise CalibrationError(
+            f"the touches together do not go with machine.toml and site.toml ({fits.normalised:.0f} sigma): check "
+            "the coordinates of the touched point, the benchmarks and the length from the bucket's pin to its edge; "
+            "nothing was written"
         )
     tool = network.statics[network.tool].name
     ratio = body.follows.ratio
@@ -153,13 +178,11 @@ def calibrate_belt(
         ratio,
         told.value(axis_static(belt)),
         told.covariance(axis_static(belt)),
-        float(
-            se3.local(first.statics[told.index(axis_static(belt))].value, told.value(axis_static(belt)))[5]
-        ),
+        moved,
         told.value(tool),
         told.covariance(tool),
         _edge_sigma(told, belt, tool, ratio),
-        tuple(fits),
+        fits,
         told,
     )
 
@@ -183,11 +206,16 @@ def _opened(network: Network, belt: str, bucket: str) -> Network:
     return replace(network, statics=tuple(statics))
 
 
-def _from(network: Network, told: Adjusted, belt: str) -> Network:
-    """The network with the phase that was found, as wide as before."""
+def _turned(network: Network, told: Adjusted, belt: str) -> float:
+    """Turn of the phase that was found, against the one about which the network has it."""
     k = told.index(axis_static(belt))
+    return float(se3.local(network.statics[k].value, told.value(axis_static(belt)))[5])
+
+
+def _from(network: Network, belt: str, turn: float) -> Network:
+    """The network with a phase turned further, as wide as before."""
     statics = list(network.statics)
-    turn = se3.local(statics[k].value, told.value(axis_static(belt)))[5]
+    k = next(k for k, static in enumerate(statics) if static.name == axis_static(belt))
     statics[k] = replace(statics[k], value=statics[k].value @ fr.turn(turn))
     return replace(network, statics=tuple(statics))
 

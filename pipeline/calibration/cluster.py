@@ -14,12 +14,12 @@ import numpy as np
 
 from pipeline.calibration.adjusted import Adjusted, adjusted, halves_disagree
 from pipeline.calibration.closures import Closures, closures
+from pipeline.calibration.contradiction import refuse_contradiction
 from pipeline.config import Machine, Site
 from pipeline.config.machine import CuttingEdge, JointBody, MovingBody
 from pipeline.config.quantities import Pose
 from pipeline.errors import CalibrationError
 from pipeline.estimation.repeated import Repeated
-from pipeline.estimation.validation import left_out
 from pipeline.geometry import se3
 from pipeline.network import network_of
 from pipeline.network.model import Network, Observations
@@ -28,8 +28,6 @@ SHARED_S = 0.2
 """Pictures of two cameras this close share an instant: the motion between them is a matter of a tenth of a second."""
 LEAST_SHARED = 5
 """Instants that a camera must share with the others."""
-WRONG_SIGMA0 = 3.0
-"""Corners this many times as far off as detection says are no noise."""
 EXACT = Pose(xyz_m=(0.0, 0.0, 0.0), rpy_deg=(0.0, 0.0, 0.0), sigma_mm=0.0, sigma_deg=0.0)
 
 
@@ -247,9 +245,7 @@ def cluster_of(
     shared = shared_instants(network, observations)
     _refuse_unshared(network, shared, network.camera_index(reference))
     whole = adjusted(network, observations, settings=site.estimation, repeated=repeated)
-    benchmarks = left_out(whole.problem, whole.optimum.values, whole.found)
-    if whole.sigma0 > WRONG_SIGMA0:
-        raise CalibrationError(_contradiction(whole))
+    benchmarks = refuse_contradiction(whole)
     odd, even = (
         adjusted(
             whole.network, _every_second(observations, half), settings=site.estimation, repeated=repeated
@@ -298,20 +294,6 @@ def _every_second(observations: Observations, half: int) -> Observations:
     instant = np.cumsum(np.concatenate([[0], np.diff(stamps) > SHARED_S * 1e9]))
     keep = instant[np.searchsorted(stamps, observations.time_ns)] % 2 == half
     return observations.take(keep)
-
-
-def _contradiction(whole: Adjusted) -> str:
-    worst: dict[str, float] = {}
-    for k, marker in enumerate(whole.network.markers):
-        rows = whole.residuals.marker == k
-        if np.any(rows):
-            worst[marker.name] = float(np.median(whole.residuals.normalised[rows]))
-    name = max(worst, key=lambda n: worst[n])
-    return (
-        f"the pictures contradict the files: corners are {whole.sigma0:.1f} times as far from where they should be as "
-        f"detection says, those of '{name}' most of all; check its tags' size_m and its survey in site.toml, and that "
-        "the cameras' intrinsics are of this lens and size; nothing was written"
-    )
 
 
 def point_sigma_m(covariance: np.ndarray, distance_m: float) -> float:

@@ -11,10 +11,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import chi2
 
 from pipeline.calibration.adjusted import Adjusted, adjusted
 from pipeline.calibration.axes import TOLD, Axis, axis_of_motion
-from pipeline.calibration.cluster import EXACT, WRONG_SIGMA0
+from pipeline.calibration.cluster import EXACT
+from pipeline.calibration.contradiction import refuse_contradiction
 from pipeline.calibration.held_points import PointFit
 from pipeline.calibration.pins import PinShot, axis_static, with_pins
 from pipeline.config import Machine, Site
@@ -27,6 +29,8 @@ from pipeline.network.model import Network, Static
 
 WIDE_M, WIDE_RAD = 0.3, 0.2
 """Prior of what is freed about its start, which is good to a hundredth of it."""
+CONTRADICTS = 1e-6
+"""Chance that file and log differ by so much and both are right: sigmas of a tape are rough."""
 NEAR_S = 0.15
 """A marker and its parent seen by pictures this close are seen together."""
 
@@ -114,14 +118,11 @@ def calibrate_mounts(
             starts[f"marker {marker} mount"] = _turned_as_in_file(machine, marker, axes[joint].T_axis_marker)
     network = _freed(network_of(_unmounted(cut, keys), site), keys, starts, cut)
     whole = adjusted(network, observations_of(network, seen), settings=site.estimation)
-    if whole.sigma0 > WRONG_SIGMA0:
-        raise CalibrationError(
-            f"the pictures contradict the files: corners are {whole.sigma0:.1f} times as far from where they should be "
-            "as detection says; check the sizes of the tags, and that what is not freed is right; nothing was written"
-        )
-    fits: list[PointFit] = []
+    refuse_contradiction(whole)
+    fits: tuple[PointFit, ...] = ()
     if pins:
-        whole, fits = with_pins(whole, {joint: _parent(machine, joint) for joint in surveyed}, pins)
+        whole, shot = with_pins(whole, {joint: _parent(machine, joint) for joint in surveyed}, pins)
+        fits = shot.each
     _refuse_untold(whole, keys, surveyed)
     told = []
     for key in keys:
@@ -132,7 +133,38 @@ def calibrate_mounts(
         if joint:
             covariance = covariance + _conventions(machine, keys, joint)
         told.append(ToldPose(key, whole.value(name), covariance, old, axes.get(joint)))
-    return Mounts(whole, tuple(told), whole.warnings, tuple(fits))
+    contradicted = [_against_file(machine, pose, surveyed) for pose in told if pose.T_file is not None]
+    return Mounts(whole, tuple(told), (*(c for c in contradicted if c), *whole.warnings), fits)
+
+
+def _against_file(machine: Machine, told: ToldPose, surveyed: Sequence[str]) -> str:
+    """A sentence where a pose lies further from the file's than both sigmas allow.
+
+    Two ends of a pin have no third that would show a typing error in one, or a shift of both: only the file has.
+    """
+    kind, name, what = told.key.split(".")
+    of = list(TOLD) if kind == "bodies" else list(range(6))
+    assert told.T_file is not None
+    moved = se3.local(told.T_file, told.T)
+    both = (told.covariance + getattr(getattr(machine, kind)[name], what).covariance_xi())[np.ix_(of, of)]
+    square = float(moved[of] @ np.linalg.solve(both, moved[of]))
+    if square <= chi2.isf(CONTRADICTS, len(of)):
+        return ""
+    places = [i for i in of if i < 3]
+    mm, deg = (
+        1000 * np.linalg.norm(moved[places]),
+        np.rad2deg(np.linalg.norm(moved[[i for i in of if i > 2]])),
+    )
+    sigmas = np.sqrt(square)
+    sentence = (
+        f"{told.key} is {mm:.0f} mm and {deg:.1f} deg from where machine.toml has it, {sigmas:.0f} sigmas"
+    )
+    if kind == "bodies" and name in surveyed:
+        raise CalibrationError(
+            f"by the shots of its pin {sentence}; check their coordinates, their times and the pin they are of, or "
+            "widen its sigmas in machine.toml if that was measured wrong; nothing was written"
+        )
+    return f"{sentence}: see whether it was knocked, or measured with a larger sigma than the file says"
 
 
 def _keys(machine: Machine, free: Sequence[str]) -> list[str]:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.calibration.adjusted import Adjusted
-from pipeline.calibration.held_points import HeldPoint, PointFit, Residual, held_point, with_points
+from pipeline.calibration.held_points import HeldPoint, PointFits, Residual, held_point, with_points
 from pipeline.errors import CalibrationError
 from pipeline.geometry import se3, so3
 from pipeline.network import frames as fr
@@ -40,7 +40,7 @@ class PinShot:
 
 def with_pins(
     whole: Adjusted, parents: dict[str, str], shots: Sequence[PinShot]
-) -> tuple[Adjusted, list[PointFit]]:
+) -> tuple[Adjusted, PointFits]:
     """The adjustment with shots of pins.
 
     Parameters
@@ -56,7 +56,7 @@ def with_pins(
     -------
     whole : Adjusted
         The same with statics, and their covariance, as the shots moved them. States are those of before.
-    fits : list of PointFit
+    fits : PointFits
 
     Raises
     ------
@@ -79,11 +79,16 @@ def with_pins(
         of_joint = [h for h, shot in zip(held, shots, strict=True) if shot.joint == joint]
         _refuse_short_pin(whole, joint, of_joint)
     told, fits = with_points(whole, held)
-    worst = max(fits, key=lambda fit: fit.normalised)
-    if worst.wrong:
+    off = fits.culprit
+    if off is not None:
         raise CalibrationError(
-            f"shot '{worst.name}' of a pin lies {1000 * worst.off_m:.0f} mm ({worst.normalised:.0f} sigma) off the "
+            f"shot '{off.name}' of a pin lies {1000 * off.off_m:.0f} mm ({off.normalised:.0f} sigma) off the "
             "axis that everything else tells; check its coordinates and its time; nothing was written"
+        )
+    if fits.wrong:
+        raise CalibrationError(
+            f"the shots of pins do not go with each other and the pictures ({fits.normalised:.0f} sigma): check their "
+            "coordinates, their times, which pin they are of, and the benchmarks; nothing was written"
         )
     return told, fits
 

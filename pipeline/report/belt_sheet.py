@@ -40,10 +40,14 @@ def belt_sheet(
     state = GOOD if u_m <= allowed_m else POOR
     phase_deg = float(np.rad2deg(told.moved_rad))
     radius_m = float(np.hypot(*told.T_bucket_tool[:2, 3]))
-    rows = [{"touch": fit.name, "off": 1000 * fit.off_m, "sigmas": fit.normalised} for fit in told.fits]
+    rows = [
+        {"touch": fit.name, "off": 1000 * fit.off_m, "sigma": 1000 * fit.sigma_m, "sigmas": fit.normalised}
+        for fit in told.fits.each
+    ]
     columns = [
         column("touch", say("touch"), kind="id"),
         column("off", say("off"), "mm", 1),
+        column("sigma", say("off_sigma"), "mm", 1),
         column("sigmas", say("sigmas"), digits=1),
     ]
     return Sheet(
@@ -57,7 +61,7 @@ def belt_sheet(
             (say("phase"), number(phase_deg, "°", 2), say("phase_note")),
             (say("angle"), number(float(np.rad2deg(told.phase_sigma_rad)), "°", 3), say("angle_note")),
             (say("radius"), number(1000 * radius_m, "mm", 1), ""),
-            (say("touches"), number(len(told.fits)), ""),
+            (say("touches"), number(len(told.fits.each)), ""),
             (words("cluster.sigma0"), number(told.whole.sigma0, "", 2), words("cluster.sigma0_note")),
         ],
         remarks=list(told.whole.warnings),

@@ -151,12 +151,14 @@ def _pins(mounts: Mounts, words: Words) -> dict:
     columns = [
         column("shot", words("mounts.shot"), kind="code"),
         column("off", words("mounts.off_axis"), "mm", 1),
+        column("sigma", words("mounts.off_sigma"), "mm", 1),
         column("sigmas", words("mounts.off_sigmas"), digits=1),
     ]
     rows = [
         {
             "shot": fit.name,
             "off": 1000 * fit.off_m,
+            "sigma": 1000 * fit.sigma_m,
             "sigmas": fit.normalised,
         }
         for fit in mounts.pins

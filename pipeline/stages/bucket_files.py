@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -164,7 +165,13 @@ def _without_turn(axis: Pose) -> dict[str, Any]:
 def points_of(
     checks_file: Path | None, point_text: str | None, site: Site
 ) -> tuple[Shots, dict[str, KnownPoint]]:
-    """Rows of the file, and known points of site.toml and of the option."""
+    """Rows of the file, and known points of site.toml; those of one point where the option names it.
+
+    Raises
+    ------
+    CalibrationError
+        The option names no point, or no row is a touch.
+    """
     scale = site.grid.metres_per_unit
     checks = site.checks
     sigma_m = (2.0 if checks is None else checks.sigma_mm) / 1000
@@ -182,27 +189,49 @@ def points_of(
             None if checks is None else checks.codes,
         )
     if point_text is not None:
-        parts = point_text.split(",")
-        if len(parts) == 3:
-            try:
-                enh = np.array([float(part) for part in parts])
-            except ValueError:
-                raise CalibrationError(f"--point {point_text}: write E,N,H as three numbers") from None
-            known = {"point": KnownPoint(enh * scale, sigma_m)}
-        elif point_text in known:
-            known = {point_text: known[point_text]}
-        else:
-            row = np.flatnonzero(shots.point.astype(str) == point_text)
-            if not len(row):
-                raise CalibrationError(
-                    f"--point {point_text}: no such point among the known points of site.toml, and no such row in "
-                    f"the file; give E,N,H in the grid unit, or one of {', '.join(known) or 'none'}"
-                )
-            sigma = float(shots.sigma_m[row[0]])
-            known = {point_text: KnownPoint(shots.p_grid[row[0]], sigma if np.isfinite(sigma) else sigma_m)}
+        shots, known = _of_one_point(point_text, shots, known, scale, sigma_m)
+    elif len(shots) and not np.isin(shots.kind.astype(str), ("control", "edge")).any():
+        raise CalibrationError(
+            f"no row of {checks_file.name if checks_file else 'the file'} is said to be a touch or a shot of the edge: "
+            "add a column kind with control or edge, or name the point that was touched with --point ID"
+        )
     if not len(shots) and not known:
         raise CalibrationError(
             "no point is known that the edge touched: give a check file, --point E,N,H, or [checks.control] in "
             "site.toml"
         )
     return shots, known
+
+
+def _of_one_point(
+    text: str, shots: Shots, known: dict[str, KnownPoint], scale: float, sigma_m: float
+) -> tuple[Shots, dict[str, KnownPoint]]:
+    """What `--point` leaves: touches of that point, whatever their rows say they are, and shots of the edge."""
+    kinds, names = shots.kind.astype(str), shots.point.astype(str)
+    if text.count(",") == 2:
+        try:
+            enh = np.array([float(part) for part in text.split(",")])
+        except ValueError:
+            enh = np.full(3, np.nan)
+        if not np.isfinite(enh).all():
+            raise CalibrationError(f"--point {text}: write E,N,H as three numbers")
+        touched = sorted(set(names[kinds == "control"]))
+        if len(touched) > 1:
+            raise CalibrationError(
+                f"--point {text}: the file has touches of several points ({', '.join(touched[:5])}); name one by its id"
+            )
+        return shots, {touched[0] if touched else "point": KnownPoint(enh * scale, sigma_m)}
+    rows = np.flatnonzero(names == text)
+    if text not in known and not len(rows):
+        raise CalibrationError(
+            f"--point {text}: no such point among the known points of site.toml, and no such row in "
+            f"the file; give E,N,H in the grid unit, or one of {', '.join(known) or 'none'}"
+        )
+    if text in known:
+        point = known[text]
+    else:
+        sigma = float(shots.sigma_m[rows[0]])
+        point = KnownPoint(shots.p_grid[rows[0]], sigma if np.isfinite(sigma) else sigma_m)
+    kind = shots.kind.copy()
+    kind[rows] = "control"
+    return replace(shots, kind=kind).take((names == text) | (kinds == "edge")), {text: point}

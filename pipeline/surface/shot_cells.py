@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import datetime
 import io
+import math
 import re
 import zoneinfo
 from collections.abc import Iterator
@@ -147,7 +148,7 @@ def number(cell: str, separator: str, where: str) -> float:
     """The number in a cell; a decimal comma is understood where the separator is not a comma. Raises SurfaceError."""
     if separator != "," and _DECIMAL_COMMA.fullmatch(cell):
         cell = cell.replace(",", ".")
-    if not _NUMBER.fullmatch(cell):
+    if not _NUMBER.fullmatch(cell) or not math.isfinite(float(cell)):
         raise SurfaceError(f"{where}: expected a number, found '{cell[:40]}'")
     return float(cell)
 
@@ -195,6 +196,8 @@ def time_ns(cell: str, zone: str, where: str) -> int:
         raise SurfaceError(f"{where}: '{cell[:40]}' is no date and time ({error})") from None
     if when.tzinfo is None:
         when = _local(when, zone, cell, where)
+    if not 1970 < when.year < 2200:  # tables have nanoseconds in 64 bits
+        raise SurfaceError(f"{where}: '{cell[:40]}' is no time of a log: check the year")
     since = when - _EPOCH
     return (since.days * 86_400 + since.seconds) * 10**9 + int(kept.ljust(9, "0") or 0)
 

@@ -8,7 +8,7 @@ name.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +61,11 @@ class Shots:
 
     def __len__(self) -> int:
         return len(self.point)
+
+    def take(self, rows: np.ndarray) -> Shots:
+        """Some of them, by index or mask."""
+        columns = ("point", "code", "p_grid", "kind", "time_ns", "edge_point", "sigma_m")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
 
 def read_shots(

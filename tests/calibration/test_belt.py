@@ -140,6 +140,13 @@ def test_a_touch_with_a_typing_error_is_named():
         calibrate_belt(machine, site, "flip", detections(drawn), [touches[0], wrong, *touches[2:]], {})
 
 
+def test_a_known_point_with_a_typing_error_is_told_from_all_its_touches_together():
+    drawn, machine, site, touches, _ = calibrated(3)
+    wrong = [replace(t, p_world=t.p_world + [0.0, 0.0, 0.1], known=0) for t in touches]
+    with pytest.raises(CalibrationError, match="touches together do not go with machine"):
+        calibrate_belt(machine, site, "flip", detections(drawn), wrong, {"TP": 0.002})
+
+
 def test_two_touches_are_too_few():
     drawn, machine, site, touches, _ = calibrated(3)
     with pytest.raises(CalibrationError, match="2 touches with a time, at least 3"):

@@ -1,5 +1,7 @@
 """A cluster told from drawn corners: OpenCV projects them, so nothing is shared with the adjustment."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -144,6 +146,35 @@ def test_a_print_of_another_size_contradicts_the_pictures(yard):
     # Where it is off by this much the adjustment may not even end; either way the size is named.
     with pytest.raises(CalibrationError, match=r"contradicts? the (files|log).* size"):
         cluster_of(network, seen(drawn, network, np.random.default_rng(0), scale=1.05), site, "bench")
+
+
+@pytest.mark.parametrize("scale", [0.99, 1.01])
+def test_prints_one_in_a_hundred_off_are_named_by_the_benchmarks(yard, scale):
+    """Their corners are at 1.3 of their sigma only; the mount was written 36 mm off, with a sigma of 2 mm."""
+    drawn, _, site, network = yard
+    with pytest.raises(
+        CalibrationError, match=r"\d+ of \d+ benchmarks are off: most likely the prints are of another"
+    ):
+        cluster_of(
+            network,
+            seen(drawn, network, np.random.default_rng(0), scale=scale),
+            site,
+            "bench",
+            repeated=WHITE,
+        )
+
+
+def test_one_benchmark_with_a_wrong_survey_is_named_alone(yard):
+    drawn, _, site, network = yard
+    rows = seen(drawn, network, np.random.default_rng(0))
+    statics = list(network.statics)
+    wrong = next(m for m in network.markers if m.name == "wall-3")
+    at = statics[wrong.mount]
+    statics[wrong.mount] = replace(at, value=at.value @ se3.exp(np.array([0.02, 0, 0, 0, 0, 0])))
+    with pytest.raises(
+        CalibrationError, match=r"'wall-3' lies (19|20|21) mm .* check its survey in site\.toml"
+    ):
+        cluster_of(replace(network, statics=tuple(statics)), rows, site, "bench", repeated=WHITE)
 
 
 def test_the_machine_is_cut_down_to_the_cluster_and_wrong_references_are_named(yard):

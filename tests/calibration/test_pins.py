@@ -78,12 +78,27 @@ def test_one_end_leaves_the_direction_open_and_is_refused(rig):
         calibrate_mounts(machine, site, (), detections, pins[:1])
 
 
-def test_a_third_shot_with_a_typing_error_is_named(rig):
+@pytest.mark.parametrize(("off", "said"), [(0.0, None), (0.1, r"bucket-3.*9\d mm|bucket-3.*10\d mm")])
+def test_a_third_shot_with_a_typing_error_is_named(rig, off, said):
     drawn, machine, site, detections, pins = rig
     more = shots(drawn, np.random.default_rng(8), half_m=0.25)
-    wrong = replace(more[0], name="bucket-3", p_world=more[0].p_world + [0.0, 0.0, 0.1])
-    with pytest.raises(CalibrationError, match=r"bucket-3.*9\d mm|bucket-3.*10\d mm"):
-        calibrate_mounts(machine, site, (), detections, [*pins, more[1], wrong])
+    third = replace(more[0], name="bucket-3", p_world=more[0].p_world + [0.0, 0.0, off])
+    if said is None:
+        assert len(calibrate_mounts(machine, site, (), detections, [*pins, more[1], third]).pins) == 4
+        return
+    with pytest.raises(CalibrationError, match=said):
+        calibrate_mounts(machine, site, (), detections, [*pins, more[1], third])
+
+
+@pytest.mark.parametrize("moved", [([0.5, 0.0, 0.0], [0.5, 0.0, 0.0]), ([0.0, 0.0, 0.0], [0.0, 0.0, 0.1])])
+def test_two_ends_that_only_the_file_contradicts_are_refused(rig, moved):
+    """Shot in another grid, or one of the two with a typing error: neither end shows it by the other."""
+    _, machine, site, detections, pins = rig
+    wrong = [replace(pin, p_world=pin.p_world + d) for pin, d in zip(pins, moved, strict=True)]
+    with pytest.raises(
+        CalibrationError, match=r"shots of its pin bodies\.bucket\.axis is \d+ mm and [\d.]+ deg"
+    ):
+        calibrate_mounts(machine, site, (), detections, wrong)
 
 
 def test_a_pin_shot_while_the_arm_moves_is_refused(rig):

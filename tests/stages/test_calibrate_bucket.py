@@ -269,3 +269,30 @@ def test_a_point_is_given_by_coordinates_or_by_name(site, tmp_path):
         points_of(file, "TP9", site)
     with pytest.raises(CalibrationError, match="no point is known"):
         points_of(None, None, site)
+
+
+def test_the_point_that_is_named_is_the_only_one_whatever_its_rows_are_called(site, tmp_path):
+    file = tmp_path / "checks.csv"
+    file.write_text(
+        "point,northing,easting,elevation,kind\nTP1,20,10,3,control\nTP2,21,11,3,control\nTP1,20,10,3,\nE,1,2,3,edge\n"
+    )
+    shots, known = points_of(file, "TP1", site)
+    assert list(known) == ["TP1"]
+    assert list(zip(shots.point, shots.kind, strict=True)) == [("TP1", "control")] * 2 + [("E", "edge")]
+    with pytest.raises(CalibrationError, match=r"touches of several points \(TP1, TP2\); name one"):
+        points_of(file, "10,20,3.1", site)
+    file.write_text("point,northing,easting,elevation,kind\nTP1,20,10,3,control\n")
+    _, known = points_of(file, "10,20,3.1", site)
+    np.testing.assert_allclose(known["TP1"].p_grid, [10, 20, 3.1])
+    for text in ("10,20,inf", "10,twenty,3"):
+        with pytest.raises(CalibrationError, match="write E,N,H as three numbers"):
+            points_of(file, text, site)
+
+
+def test_a_file_that_says_of_no_row_that_it_is_a_touch_is_refused(site, tmp_path):
+    file = tmp_path / "checks.csv"
+    file.write_text("point,northing,easting,elevation,time\nTP1,20,10,3,2025-06-15T15:06:10Z\n")
+    with pytest.raises(CalibrationError, match="add a column kind with control or edge"):
+        points_of(file, None, site)
+    shots, _ = points_of(file, "TP1", site)
+    assert list(shots.kind) == ["control"]

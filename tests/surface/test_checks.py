@@ -78,6 +78,7 @@ def test_an_empty_file_has_no_shots(tmp_path):
     [
         ("hello\nworld\n", "the first one is 'hello'"),
         (PLAIN + "3,abc,2,3,x\n", r"checks\.csv:3: expected a number, found 'abc'"),
+        (PLAIN + "3,1e400,2,3,x\n", r"checks\.csv:3: expected a number, found '1e400'"),
         (PLAIN + "3,1,2,\n", r"checks\.csv:3: expected a number, found ''"),
         (PLAIN + "3,1\n", r"checks\.csv:3: .* found 2 columns"),
         (PLAIN + "3,inf,2,3,x\n", "found 'inf'"),

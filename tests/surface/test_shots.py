@@ -91,6 +91,7 @@ def test_a_local_time_is_that_of_the_site_and_one_that_is_twice_is_refused(tmp_p
         ("2026-07-01T08:30:00", "Mars/Olympus", "not in the database of time zones"),
         ("01.07.2026 08:30", "Europe/Helsinki", r"checks\.csv:2: expected a date and time such as 2026"),
         ("2026-13-01T08:30Z", "", "is no date and time"),
+        ("2926-01-01T08:30Z", "", "is no time of a log: check the year"),
     ):
         with pytest.raises(SurfaceError, match=sentence):
             read(time, zone)
