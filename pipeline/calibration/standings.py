@@ -263,7 +263,7 @@ def touched(
         sigma: float,
         point: str | None,
         edge_point: str,
-        by_time: bool,
+        row_ns: int = NO_TIME,
     ) -> None:
         if standing not in used:
             used[standing] = len(out.stands)
@@ -275,13 +275,13 @@ def touched(
                 out.points.append(sigma)
                 out.point_names.append(point)
         at = Touch(
-            f"{name} at {_clock(found[standing])}",
+            f"{name} at {_clock(found[standing]) if row_ns == NO_TIME else _clock_of(row_ns)}",
             used[standing],
             p_grid - origin_m,
             contact_m if k >= 0 else sigma,
             k,
             edge_point,
-            by_time,
+            row_ns != NO_TIME,
         )
         out.touches.append(at)
         out.times_ns.append((found[standing].first_ns + found[standing].last_ns) // 2)
@@ -319,12 +319,12 @@ def touched(
                 sigma,
                 name if kind == "control" else None,
                 edge_point,
-                shots.time_ns[i] != NO_TIME,
+                int(shots.time_ns[i]),
             )
     named = {str(shots.point[i]) for i in range(len(shots)) if shots.kind[i] == "control"}
     for name, point in known.items():
         for k in () if name in named else _near(found, point.p_grid - origin_m, reach_m, width_m, radius_m):
-            add(k, name, point.p_grid, point.sigma_m, name, tooth, False)
+            add(k, name, point.p_grid, point.sigma_m, name, tooth)
     return out
 
 
@@ -351,7 +351,11 @@ def _near(
 
 
 def _clock(standing: Standing) -> str:
-    seconds = (standing.first_ns + standing.last_ns) // 2 // 10**9 % 86_400
+    return _clock_of((standing.first_ns + standing.last_ns) // 2)
+
+
+def _clock_of(time_ns: int) -> str:
+    seconds = time_ns // 10**9 % 86_400
     return f"{seconds // 3600:02d}:{seconds // 60 % 60:02d}:{seconds % 60:02d}"
 
 

@@ -76,5 +76,5 @@ def say_written(written: Any) -> None:
     for remark in written.remarks:
         click.echo(f"! {remark}")
     if written.file is not None:
-        click.echo(f"written: {written.file}; the old file is {written.kept.name}")
+        click.echo(f"written: {written.file}; the old file is {written.kept}")
     click.echo(f"sheet: {written.sheet}")

@@ -93,7 +93,7 @@ def bucket_sheet(facts: BucketFacts, language: str = "en") -> Sheet:
     unlikely = redundancy > 0 and chi2.sf(statistic, redundancy) < UNLIKELY
     state = OPEN if unlikely else GOOD if facts.good else POOR
     sentence = say(
-        "sentence",
+        state,
         u=text_of(1000 * facts.expanded_m, 1),
         radius=text_of(r, 2),
         limit=text_of(1000 * facts.tolerance_m, 1),

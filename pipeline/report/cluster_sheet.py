@@ -246,7 +246,7 @@ def _closure_picture(cluster: Cluster, words: Words) -> Picture:
             axes.set_xlabel(words("cluster.seconds"))
             axes.set_ylabel(words(label))
             axes.set_ylim(bottom=0)
-        left.legend()
+        figure.legend(*left.get_legend_handles_labels(), loc="outside upper right", ncols=3)
         return figure
 
     return Picture(

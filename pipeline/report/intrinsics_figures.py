@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.contour import QuadContourSet
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from pipeline.calibration.procedure import Intrinsics
 from pipeline.report import palette
@@ -32,9 +34,13 @@ def draw_coverage(found: Intrinsics) -> Figure:
     seen.plot(*uv[used].T, ".", color=palette.AS_BUILT, markersize=1.6, label="used")
     if np.any(~used):
         seen.plot(*uv[~used].T, "x", color=palette.CHECK, markersize=3, label="left out")
-        seen.legend(loc="upper left", bbox_to_anchor=(0, -0.08), ncols=2)
-    _frame(missed, found.size, f"Observed minus predicted, RMS {found.solution.rms_px:.2f} px")
+        seen.legend(loc="upper left", bbox_to_anchor=(0, -0.2), ncols=2)
     scale = found.size[0] / ARROW_SIDES / max(found.solution.rms_px, 1e-6)
+    _frame(
+        missed,
+        found.size,
+        f"Observed minus predicted (RMS {found.solution.rms_px:.2f} px), enlarged {scale:,.0f} times",
+    )
     missed.quiver(
         *uv[used].T, *residual[used].T * scale, angles="xy", scale_units="xy", scale=1, width=0.0018,
         color=palette.AS_BUILT,
@@ -49,40 +55,36 @@ def draw_halves(found: Intrinsics) -> Figure:
     figure = new_figure(2.8)
     maps = ((halves.found_m, "Odd against even views"), (halves.predicted_m, "What chance would give"))
     top = 1000 * float(np.nanmax([np.nanmax(halves.found_m), np.nanmax(halves.predicted_m)]))
-    _maps(figure, found.size, halves.uv, maps, top)
+    axes = figure.subplots(1, 2)
+    drawn = [
+        _map(at, found.size, halves.uv, m, title, top) for at, (m, title) in zip(axes, maps, strict=True)
+    ]
+    figure.colorbar(drawn[0], ax=list(axes), shrink=0.85).set_label("mm")
     return figure
 
 
 def draw_placing(found: Intrinsics) -> Figure:
-    """Standard deviation of where a tag is seen, across and along the view."""
+    """Standard deviation of where a tag is seen, across and along the view; the latter is many times the former."""
     p = found.placing
     figure = new_figure(2.8)
-    top = 1000 * float(np.nanmax([np.nanmax(p.across_m), np.nanmax(p.along_m)]))
-    _maps(figure, found.size, p.uv, ((p.across_m, "Across the view"), (p.along_m, "Along the view")), top)
+    maps = ((p.across_m, "Across the view"), (p.along_m, "Along the view"))
+    for at, (m, title) in zip(figure.subplots(1, 2), maps, strict=True):
+        drawn = _map(at, found.size, p.uv, m, title, 1000 * float(np.nanmax(m)))
+        figure.colorbar(drawn, ax=at, shrink=0.85).set_label("mm")
     return figure
 
 
-def _maps(
-    figure: Figure,
-    size: tuple[int, int],
-    uv: np.ndarray,
-    maps: tuple[tuple[np.ndarray, str], ...],
-    top_mm: float,
-) -> None:
-    axes = figure.subplots(1, len(maps))
-    levels = np.linspace(0, top_mm * 1.001 + 1e-9, 9)
-    drawn = None
-    for at, (values_m, title) in zip(axes, maps):
-        _frame(at, size, title)
-        at.grid(False)
-        drawn = at.contourf(uv[..., 0], uv[..., 1], 1000 * values_m, levels=levels, cmap=_LOW_TO_BAD)
-        lines = at.contour(
-            uv[..., 0], uv[..., 1], 1000 * values_m, levels=levels, colors=palette.MUTED, linewidths=0.4
-        )
-        at.clabel(lines, fmt="%.2g", fontsize=6.5)
-    assert drawn is not None
-    bar = figure.colorbar(drawn, ax=list(axes), shrink=0.85)
-    bar.set_label("mm")
+def _map(
+    at: Axes, size: tuple[int, int], uv: np.ndarray, values_m: np.ndarray, title: str, top_mm: float
+) -> QuadContourSet:
+    _frame(at, size, title)
+    at.grid(False)
+    levels = MaxNLocator(8).tick_values(0, max(top_mm, 1e-6))
+    u, v = uv[..., 0], uv[..., 1]
+    drawn = at.contourf(u, v, 1000 * values_m, levels=levels, cmap=_LOW_TO_BAD)
+    lines = at.contour(u, v, 1000 * values_m, levels=levels, colors=palette.MUTED, linewidths=0.4)
+    at.clabel(lines, levels[1::2], fmt="%g", fontsize=6.5)
+    return drawn
 
 
 def _frame(at: Axes, size: tuple[int, int], title: str) -> None:

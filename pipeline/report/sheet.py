@@ -41,7 +41,7 @@ class Demand:
     def judge(self, sigma_m: float, words: Words, key: str, **places: str) -> tuple[str, str]:
         """Whether a sigma at the cutting edge is good enough, and the sentence that says so.
 
-        The sentence stands under ``<key>.good`` or ``<key>.poor`` and may name mm, distance, limit and tolerance.
+        The sentence stands under ``<key>.good`` or ``<key>.poor`` and may name mm, distance, limit, tolerance and k.
         """
         limit_m = SHARE * self.tolerance_m / self.coverage_factor
         state = GOOD if sigma_m <= limit_m else POOR
@@ -51,6 +51,7 @@ class Demand:
             distance=f"{self.distance_m:g}",
             limit=f"{1000 * limit_m:.1f}",
             tolerance=f"{1000 * self.tolerance_m:g}",
+            k=f"{self.coverage_factor:g}",
             **places,
         )
         return state, said

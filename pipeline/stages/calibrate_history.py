@@ -44,8 +44,16 @@ def run(
             "the files are of different machines: " + ", ".join(sorted({m.machine.id for m in machines}))
         )
     found = history(machines, today, distance_m)
+    dates = [c.date for changes in found.values() for c in changes if c.date is not None]
+    if dates and today < max(dates):
+        raise CalibrationError(
+            f"on {today.isoformat()}, against which ages are to be counted, the latest calibration "
+            f"({max(dates).isoformat()}) was not made yet; give --today a later day"
+        )
     rows = [_row(change) for changes in found.values() for change in changes]
     sentences = []
+    if len({hashlib.sha256(text).digest() for text in texts}) == 1:
+        sentences.append("there is one file only, so nothing can be told to have moved: name older ones too")
     for key, changes in found.items():
         for change in changes[1:]:
             if change.sigmas is not None and change.sigmas > MOVED_SIGMAS:

@@ -97,7 +97,7 @@ def test_the_sheet_says_in_millimetres_whether_the_bucket_is_good_enough(toleran
     said = facts(tolerance_m)
     html, content = render_sheet(bucket_sheet(said))
     assert content["state"] == state
-    assert f"± {1000 * said.expanded_m:.1f} mm (k = 2)" in content["sentence"]
+    assert f"U = {1000 * said.expanded_m:.1f} mm (k = 2)" in content["sentence"]
     assert "2 shot of the floor" in " ".join(content["remarks"])
     assert html.count("touch 7") >= 1 and "<svg" in html
 

@@ -143,7 +143,7 @@ def test_rows_with_a_time_go_to_the_stand_nearest_in_time():
     assert (
         told.touches[0].sigma_m == 0.001 and told.points == [0.002] and told.touches[0].edge_point == "middle"
     )
-    assert told.touches[0].name == "P at 00:00:10"
+    assert told.touches[0].name == "P at 00:00:11"
 
 
 def test_a_point_without_times_is_where_the_edge_could_reach_it():
