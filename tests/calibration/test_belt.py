@@ -16,6 +16,7 @@ from pipeline.config.rewriting import with_values
 from pipeline.errors import CalibrationError
 from pipeline.estimation import adjust
 from pipeline.estimation.repeated import WHITE
+from pipeline.geometry import so3
 from pipeline.network import network_of
 from pipeline.report.belt_sheet import belt_sheet
 from pipeline.report.sheet import render_sheet
@@ -133,6 +134,23 @@ def test_errors_of_the_edge_with_calibrated_belts_are_as_large_as_said():
     assert 0.6 < ratio < 1.26
 
 
+def test_touches_of_one_stand_share_the_error_of_its_pose():
+    """However they lie in it: two seconds of pictures tell one pose, and not one for each touch."""
+    drawn, machine, site, touches, _ = calibrated(3)
+    sigma = []
+    for spread_s in (0.0, 0.4):
+        several = [
+            replace(touch, name=f"{touch.name}-{k}", time_ns=touch.time_ns + round(k * spread_s * 1e9))
+            for touch in touches
+            for k in range(-2, 3)
+        ]
+        sigma.append(calibrate_belt(machine, site, "flip", detections(drawn), several, {}).phase_sigma_rad)
+    print(
+        f"sigma of the phase {np.rad2deg(sigma[0]):.3f} deg at one instant, {np.rad2deg(sigma[1]):.3f} over 1.6 s"
+    )
+    assert sigma[1] == pytest.approx(sigma[0], rel=0.05)
+
+
 def test_a_touch_with_a_typing_error_is_named():
     drawn, machine, site, touches, _ = calibrated(3)
     wrong = replace(touches[1], p_world=touches[1].p_world + [0.0, 0.1, 0.0])
@@ -145,6 +163,29 @@ def test_a_known_point_with_a_typing_error_is_told_from_all_its_touches_together
     wrong = [replace(t, p_world=t.p_world + [0.0, 0.0, 0.1], known=0) for t in touches]
     with pytest.raises(CalibrationError, match="touches together do not go with machine"):
         calibrate_belt(machine, site, "flip", detections(drawn), wrong, {"TP": 0.002})
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "said"), [(15.0, None), (120.0, "no answer was found|from where machine.toml")]
+)
+def test_a_phase_is_found_from_nearby_and_refused_from_afar(off_deg, said):
+    drawn, machine, site, touches, _ = calibrated(3)
+    flip = machine.bodies["flip"]
+    R = flip.axis.transform()[:3, :3] @ so3.exp(np.array([0.0, 0.0, np.deg2rad(off_deg)]))
+    turned = flip.axis.model_copy(update={"rpy_deg": tuple(so3.to_rpy_deg(R))})
+    far = machine.model_copy(
+        update={"bodies": {**machine.bodies, "flip": flip.model_copy(update={"axis": turned})}}
+    )
+    if said is None:
+        near = calibrate_belt(machine, site, "flip", detections(drawn), touches, {})
+        told = calibrate_belt(far, site, "flip", detections(drawn), touches, {})
+        print(
+            f"phase moved {np.rad2deg(told.moved_rad):.2f} deg, from the file {np.rad2deg(near.moved_rad):.2f}"
+        )
+        assert told.moved_rad - near.moved_rad == pytest.approx(-np.deg2rad(off_deg), abs=2e-4)
+        return
+    with pytest.raises(CalibrationError, match=said):
+        calibrate_belt(far, site, "flip", detections(drawn), touches, {})
 
 
 def test_two_touches_are_too_few():
