@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipeline.calibration import pins
 from pipeline.calibration.mounts import calibrate_mounts
 from pipeline.calibration.pins import PinShot
 from pipeline.errors import CalibrationError
@@ -70,6 +71,28 @@ def test_errors_of_axes_from_pins_are_as_large_as_their_covariances_say():
     print(f"errors over their sigma {ratio:.2f}, 16 machines")
     # 64 squares: 99 % of their mean lies within 0.60 and 1.51.
     assert 0.77 < ratio < 1.23
+
+
+def test_derivatives_of_a_shot_off_its_axis_are_those_by_differences(rig):
+    _, machine, site, detections, pins_ = rig
+    whole = calibrate_mounts(machine, site, (), detections, pins_).whole
+    residual, z = pins._off_axis(whole, "bucket"), whole.optimum.values.z
+    T, p, h = se3.exp(np.array([0.3, -2.0, 1.0, 0.4, 0.2, -0.5])), np.array([1.0, 0.7, -0.3]), 1e-6
+    _, by_pose, by_point, by_z = residual(T, p, z)
+
+    def differences(of, n):
+        return np.array([(of(h * e)[0] - of(-h * e)[0]) / (2 * h) for e in np.eye(n)]).T
+
+    assert by_pose == pytest.approx(differences(lambda d: residual(T @ se3.exp(d), p, z), 6), abs=1e-6)
+    assert by_point == pytest.approx(differences(lambda d: residual(T, p + d, z), 3), abs=1e-6)
+    assert by_z == pytest.approx(differences(lambda d: residual(T, p, z + d), len(z)), abs=1e-6)
+
+
+def test_two_ends_a_hand_apart_leave_the_direction_open_and_are_refused(rig):
+    drawn, machine, site, detections, _ = rig
+    near = shots(drawn, np.random.default_rng(4), half_m=0.05)
+    with pytest.raises(CalibrationError, match=r"within 0\.25 m and leave its direction open"):
+        calibrate_mounts(machine, site, (), detections, near)
 
 
 def test_one_end_leaves_the_direction_open_and_is_refused(rig):
