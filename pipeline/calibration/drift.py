@@ -98,7 +98,7 @@ def history(machines: Sequence[Machine], today: datetime.date, distance_m: float
     today : datetime.date
         Against which ages are counted.
     distance_m : float
-        From the quantity to the cutting edge.
+        From the quantity to the cutting edge; the pin of the body with the edge, and the edge itself, know better.
 
     Returns
     -------
@@ -112,13 +112,23 @@ def history(machines: Sequence[Machine], today: datetime.date, distance_m: float
             before = last.get(now.key)
             if before is not None and _same(before, now):
                 continue
-            sigmas, edge_mm = (None, None) if before is None else _moved(before, now, distance_m)
+            lever_m = _lever_m(machine, now.key, distance_m)
+            sigmas, edge_mm = (None, None) if before is None else _moved(before, now, lever_m)
             date = now.calibrated.date if now.calibrated else None
             by = now.calibrated.by if now.calibrated else ""
             age = None if date is None else (today - date).days
             found.setdefault(now.key, []).append(Change(now.key, date, by, sigmas, edge_mm, age))
             last[now.key] = now
     return found
+
+
+def _lever_m(machine: Machine, key: str, distance_m: float) -> float:
+    edge = machine.cutting_edge
+    if key == "cutting_edge.mount":
+        return 0.5 * edge.width_m
+    if key == f"bodies.{edge.body}.axis":
+        return float(np.linalg.norm(edge.mount.xyz_m))
+    return distance_m
 
 
 def _same(before: Quantity, now: Quantity) -> bool:

@@ -5,12 +5,14 @@ from __future__ import annotations
 import datetime
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from pipeline.calibration import belt as belts
 from pipeline.calibration.belt import EdgeTouch, belt_on, calibrate_belt
+from pipeline.calibration.curve_fit import azimuth_of
 from pipeline.config import load_machine, load_site
 from pipeline.config.rewriting import with_values
 from pipeline.errors import CalibrationError
@@ -163,6 +165,39 @@ def test_a_known_point_with_a_typing_error_is_told_from_all_its_touches_together
     wrong = [replace(t, p_world=t.p_world + [0.0, 0.0, 0.1], known=0) for t in touches]
     with pytest.raises(CalibrationError, match="touches together do not go with machine"):
         calibrate_belt(machine, site, "flip", detections(drawn), wrong, {"TP": 0.002})
+
+
+def test_only_the_phase_is_open_and_only_it_is_written_as_told():
+    """An angle of the chain shows as one sum: where the bucket's zero is and how the edge lies in it are held."""
+    _, machine, site, _, text = calibrated(3)
+    network = network_of(machine, site)
+    opened = belts._opened(network, "flip", "bucket")
+    index = {static.name: k for k, static in enumerate(network.statics)}
+    phase, zero = opened.statics[index["joint flip axis"]], opened.statics[index["joint bucket axis"]]
+    assert phase.covariance[5, 5] == pytest.approx(np.deg2rad(20) ** 2) and zero.covariance[5, 5] == 0
+    assert network.statics[index["joint bucket axis"]].covariance[5, 5] > 0
+    tool = opened.statics[network.tool]
+    _, J = azimuth_of(tool.value)
+    assert J @ network.statics[network.tool].covariance @ J > 1e-9
+    assert J @ tool.covariance @ J == pytest.approx(0, abs=1e-15)
+    told = SimpleNamespace(
+        joint="flip",
+        T_parent_axis=np.eye(4),
+        axis=np.eye(6) * 1e-6,
+        T_bucket_tool=tool.value,
+        tool=tool.covariance,
+    )
+    new = load_machine(with_values(text, "machine.toml", belt_values(machine, told, STAMP)), "machine.toml")
+    bucket, flip = (new.bodies[name].axis.covariance_xi() for name in ("bucket", "flip"))
+    assert bucket[5, 5] == 0 and bucket[0, 0] > 0 and flip[5, 5] == pytest.approx(1e-6)
+
+
+def test_the_bucket_turns_less_than_its_belt_by_the_ratio():
+    sigma = np.deg2rad([0.2, 0.1])
+    for ratio in (2.0, -2.0):
+        axis = np.diag([0, 0, 0, 0, 0, sigma[0] ** 2])
+        told = belts.ToldBelt("flip", ratio, np.eye(4), axis, 0.0, np.eye(4), np.eye(6), 0.0, None, None)
+        assert told.phase_sigma_rad == pytest.approx(sigma[1])
 
 
 @pytest.mark.parametrize(

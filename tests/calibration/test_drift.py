@@ -51,6 +51,31 @@ def test_changes_in_closed_form():
     assert turned.age_days == 31
 
 
+def test_what_carries_the_edge_moves_it_by_its_own_lever():
+    text = SAMPLE.read_text(encoding="utf-8")
+    machine = load_machine(text, "machine.toml")
+    axis, edge = machine.bodies["bucket"].axis, machine.cutting_edge
+    turned = {
+        "xyz_m": list(axis.xyz_m),
+        "rpy_deg": [axis.rpy_deg[0], axis.rpy_deg[1], axis.rpy_deg[2] + 0.1],
+        "sigma_mm": 1.0,
+        "sigma_deg": 0.01,
+    }
+    new = load_machine(with_values(text, "machine.toml", {"bodies.bucket.axis": turned}), "machine.toml")
+    change = history([machine, new], TODAY, 8.0)["bodies.bucket.axis"][1]
+    assert change.edge_mm == pytest.approx(
+        1000 * np.linalg.norm(edge.mount.xyz_m) * np.deg2rad(0.1), rel=1e-3
+    )
+
+
+def test_one_file_and_a_day_before_its_calibrations_are_said(tmp_path):
+    (tmp_path / "machine.toml").write_text(texts()[2], encoding="utf-8")
+    _, sentences = calibrate_history.run([tmp_path / "machine.toml"], TODAY, 8.0)
+    assert "there is one file only" in sentences[0]
+    with pytest.raises(CalibrationError, match="was not made yet; give --today a later day"):
+        calibrate_history.run([tmp_path / "machine.toml"], datetime.date(2026, 4, 30), 8.0)
+
+
 def test_a_quantity_that_is_as_before_adds_no_row():
     machines = [load_machine(text, "machine.toml") for text in texts()]
     assert len(history(machines, TODAY, 8.0)["cameras.bench.mount"]) == 1
