@@ -97,7 +97,7 @@ def marker_pose(marker: SurveyedMarker) -> MarkerPose:
         meant = f"; with {_listed(marker, orders[0])} they fit a print that can be seen" if orders else ""
         raise CalibrationError(
             f"marker '{marker.name}': its print would face away from where it is looked at, as if its corners were "
-            f"named in mirrored order, or seen from behind{meant}"
+            f"named in mirrored order, or seen from behind{meant}; or northing and easting are exchanged (see --order)"
         )
     return found
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import math
 from pathlib import Path
 
 import click
@@ -67,6 +68,8 @@ def _station(text: str | None) -> tuple[float, float, float] | None:
         return None
     try:
         e, n, h = (float(part) for part in text.split(","))
+        if not math.isfinite(e + n + h):
+            raise ValueError
     except ValueError:
         raise UsageError(
             "--station: write easting, northing and elevation, such as 356131.2,5812424.0,36.1"

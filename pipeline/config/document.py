@@ -20,6 +20,10 @@ Model = TypeVar("Model", bound=BaseModel)
 Location = tuple[str | int, ...]
 
 
+SIGNS = {"machine": "bodies", "site": "grid"}
+"""Tables that only one of the two files has, and always."""
+
+
 def load_machine(text: str, source: str) -> Machine:
     """The machine that a machine.toml describes; `source` is how messages call the file.
 
@@ -69,6 +73,11 @@ def _load(text: str, source: str, model: type[Model]) -> Model:
         where = re.search(r"\(at line (\d+), column \d+\)", str(error))
         line = f":{where.group(1)}" if where else ""
         raise ConfigError(f"{source}{line}: not valid TOML: {error}") from None
+    other = {Machine: "site", Site: "machine"}[model]
+    if SIGNS[other] in data and SIGNS[model.__name__.lower()] not in data:
+        raise ConfigError(
+            f"{source}: is a {other}.toml, and a {model.__name__.lower()}.toml is needed in its place"
+        )
     try:
         # Strict, or "3" and true would pass for numbers; strict knows tuples, TOML only lists.
         return model.model_validate(_tuples(data), strict=True)

@@ -9,7 +9,6 @@ from __future__ import annotations
 import csv
 import datetime
 import io
-import math
 import re
 import zoneinfo
 from collections.abc import Iterator
@@ -144,11 +143,15 @@ def layout_of(headings: list[str] | None, order: str, source: str) -> Layout:
     )
 
 
+MOST = 1e9
+"""No grid has larger coordinates, in whatever unit."""
+
+
 def number(cell: str, separator: str, where: str) -> float:
     """The number in a cell; a decimal comma is understood where the separator is not a comma. Raises SurfaceError."""
     if separator != "," and _DECIMAL_COMMA.fullmatch(cell):
         cell = cell.replace(",", ".")
-    if not _NUMBER.fullmatch(cell) or not math.isfinite(float(cell)):
+    if not _NUMBER.fullmatch(cell) or not abs(float(cell)) <= MOST:
         raise SurfaceError(f"{where}: expected a number, found '{cell[:40]}'")
     return float(cell)
 

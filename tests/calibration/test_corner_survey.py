@@ -111,6 +111,10 @@ def test_a_mirrored_order_is_named_where_it_is_known_from_where_the_print_is_see
         marker_pose(marker(shot(SQUARE)[[1, 0, 3, 2]], SQUARE, faces=before))
     assert "mirrored order" in str(error.value)
     assert "TR is TL, TL is TR, BL is BR, BR is BL" in str(error.value)
+    # A whole survey with its first two columns exchanged is a mirrored one.
+    exchanged = shot(SQUARE)[:, [1, 0, 2]]
+    with pytest.raises(CalibrationError, match="northing and easting are exchanged"):
+        marker_pose(marker(exchanged, SQUARE, faces=before[[1, 0, 2]]))
 
 
 def test_a_typing_error_is_named_with_its_size():

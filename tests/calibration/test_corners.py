@@ -115,7 +115,7 @@ def test_a_grid_of_tags_is_laid_out_as_it_is_printed(upwards, turned):
 
 def test_tags_of_another_share_of_their_square_than_said_are_told():
     waved = WavedBoard(CHARUCO, LENS, SIZE, 4)
-    for square, said in ((0.08, ""), (0.07, "its tags measure 0.7")):
+    for square, said in ((0.08, ""), (0.0755, "its tags measure 0.75 of a square in the pictures, and 0.79")):
         finder = CornerFinder(parse_board(f"charuco:9x6:{square}:0.06:{CHARUCO.dictionary}"))
         for index, T in enumerate(waved.poses(6)):
             finder.add(str(index), waved.picture(index, T))

@@ -34,6 +34,16 @@ sigma_mm = [50, 80]
 """
 
 
+def test_one_file_in_the_place_of_the_other_is_said_in_one_line(machine_text, site_text):
+    with pytest.raises(ConfigError) as error:
+        load_machine(site_text, "site.toml")
+    assert str(error.value) == "site.toml: is a site.toml, and a machine.toml is needed in its place"
+    with pytest.raises(
+        ConfigError, match=r"^a: is a machine\.toml, and a site\.toml is needed in its place$"
+    ):
+        load_site(machine_text, "a")
+
+
 def test_buried_lines_load_with_their_sigmas_in_metres(site_text):
     site = load_site(site_text + GAS, "site.toml")
     assert site.utilities["gas"].sigmas_m == (0.05, 0.08) and site.utilities["gas"].clearance_mm == 500
