@@ -77,11 +77,13 @@ def _sync_folder(folder: Path) -> None:
 def _storage_error(path: Path, error: OSError) -> ArtefactError:
     if error.errno in _NO_SPACE:
         return ArtefactError(
-            f"the disk is full: {path} could not be written; free some space, or give --runs a folder on "
+            f"the disk is full: {path} could not be written; free some space, or name a folder on "
             "another disk, and run the same command again (nothing half-written was left behind)"
         )
     reason = error.strerror or str(error)
-    return ArtefactError(f"{path} cannot be written ({reason}); give --runs a folder you may write to")
+    return ArtefactError(
+        f"{path} cannot be written ({reason}); make its folder writable, or name another one"
+    )
 
 
 def json_bytes(value: Any) -> bytes:

@@ -289,5 +289,5 @@ def test_run_folder_that_cannot_be_written(gradetrace, recorded, tmp_path):
     done = gradetrace("report", recorded / "short.mcap", "--runs", tmp_path / "runs" / "deeper")
     assert done.code == REFUSED
     assert re.fullmatch(
-        r"gradetrace: .* cannot be written \(.*\); give --runs a folder you may write to\n", done.err
+        r"gradetrace: .* cannot be written \(.*\); make its folder writable, or name another one\n", done.err
     )

@@ -116,7 +116,9 @@ def test_defect_of_ours_while_writing_keeps_its_type(tmp_path):
 
 def test_folder_that_cannot_be_made_is_told(tmp_path):
     (tmp_path / "runs").write_bytes(b"a file is in the way")
-    with pytest.raises(ArtefactError, match=r"cannot be written .*give --runs a folder you may write to"):
+    with pytest.raises(
+        ArtefactError, match=r"cannot be written .*make its folder writable, or name another one"
+    ):
         atomic_write(tmp_path / "runs" / "trench" / "x", b"")
     with pytest.raises(ArtefactError, match="cannot be written"):
         RunFolder(tmp_path / "runs" / "trench").create()

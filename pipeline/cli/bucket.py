@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, say_written, usable_cores
+from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, Finite, say_written, usable_cores
 
 
 @click.command()
@@ -22,7 +22,7 @@ from pipeline.cli.options import JOBS, LOG, RUNS, SITE, WRITTEN_MACHINE, say_wri
     show_default=True,
     help="What touched a known point, where CHECKS does not say; any tells nothing along the edge.",
 )
-@click.option("--contact-mm", type=click.FloatRange(0.1, 50), default=1.0, show_default=True,
+@click.option("--contact-mm", type=Finite(0.1, 50), default=1.0, show_default=True,
               help="How well a tooth sits on the mark, standard deviation.")  # fmt: skip
 @click.option("--sensor", metavar="NAME", help="Which sensor, where several read the bucket's joint.")
 @click.option("--wear", is_flag=True, help="Hold curve and mount, and tell how much the teeth are worn.")

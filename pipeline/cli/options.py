@@ -2,11 +2,23 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 from typing import Any
 
 import click
+
+
+class Finite(click.FloatRange):
+    """A number in a range: click takes nan for one in any, and infinity where the range is open."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        number = float(super().convert(value, param, ctx))
+        if not math.isfinite(number):
+            self.fail(f"{value} is no finite number.", param, ctx)
+        return number
+
 
 FILE = click.Path(path_type=Path, dir_okay=False)
 LOG = click.argument("log", metavar="LOG", type=click.Path(path_type=Path))
@@ -47,7 +59,7 @@ def distance(default: float, what: str, least: float = 0.5, most: float = 100) -
         "--distance",
         "distance_m",
         metavar="METRES",
-        type=click.FloatRange(least, most),
+        type=Finite(least, most),
         default=default,
         show_default=True,
         help=what,

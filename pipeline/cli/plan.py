@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import click
 
+from pipeline.cli.options import Finite
 from pipeline.errors import UsageError
 
 
@@ -18,18 +20,16 @@ from pipeline.errors import UsageError
 @click.option(
     "--at", metavar="POSTURE", help="One posture too: boom,stick,bucket in degrees, or reach=6,depth=1.5."
 )
-@click.option("--reach", type=click.FloatRange(1, 15), default=6.0, show_default=True,
+@click.option("--reach", type=Finite(1, 15), default=6.0, show_default=True,
               help="From the swing centre to the edge while it cuts, m.")  # fmt: skip
 @click.option("--faces", type=click.Choice(["down", "up"]), default="down", show_default=True,
               help="Which stations the machine looks towards; it retreats the other way.")  # fmt: skip
-@click.option("--boom", type=click.FloatRange(1, 15), help="Length of the boom, m.")
+@click.option("--boom", type=Finite(1, 15), help="Length of the boom, m.")
 @click.option("--boom-foot", metavar="X,Y,Z", help="Pin of the boom in the cab, m.")
-@click.option("--ground", type=float, help="Elevation that the tracks stand on, grid unit.")
-@click.option(
-    "--sigma-px", type=click.FloatRange(0.001, 5), help="Of a corner of a tag of 40 px; the paper had 0.2."
-)
-@click.option("--frame-rate", type=click.FloatRange(0.1, 200), help="Of each camera, 1/s.")
-@click.option("--looks", type=click.FloatRange(1), help="Over the shift, each from another posture.")
+@click.option("--ground", type=Finite(-1e5, 1e5), help="Elevation that the tracks stand on, grid unit.")
+@click.option("--sigma-px", type=Finite(0.001, 5), help="Of a corner of a tag of 40 px; the paper had 0.2.")
+@click.option("--frame-rate", type=Finite(0.1, 200), help="Of each camera, 1/s.")
+@click.option("--looks", type=Finite(1, 1e6), help="Over the shift, each from another posture.")
 @click.option(
     "--points", type=click.IntRange(10, 300), default=100, show_default=True, help="Along a side of a map."
 )
@@ -65,6 +65,8 @@ def plan(machine: Path, site: Path, run: Path | None, area: str | None, at: str 
         points,
         search,
     )
+    if out.suffix == ".json":
+        raise UsageError(f"--out {out}: the numbers go into a .json beside the page; name the page .html")
     sheet, sentence, _ = plan_of_files(machine, site, wishes, run)
     put_sheet(sheet, out)
     click.echo(sentence)
@@ -80,6 +82,6 @@ def _numbers(option: str, text: str | None, separator: str, count: int) -> list[
         found = [float(part) for part in text.split(separator)]
     except ValueError:
         found = []
-    if len(found) != count:
+    if len(found) != count or not all(map(math.isfinite, found)):
         raise UsageError(f"{option} {text}: give {count} numbers with '{separator}' between them")
     return found

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import click
 
-from pipeline.cli.options import FILE, distance, say_written
+from pipeline.cli.options import FILE, Finite, distance, say_written
 from pipeline.errors import UsageError
 
 
@@ -18,7 +18,7 @@ from pipeline.errors import UsageError
               help="site.toml with the prints of the markers; their poses are written into it.")  # fmt: skip
 @click.option("--order", type=click.Choice(["PNEZD", "PENZD", "named"]), default="PNEZD", show_default=True,
               help="Order of the columns; named: as the line of headings says.")  # fmt: skip
-@click.option("--sigma-mm", type=click.FloatRange(0.01, 100), default=2.0, show_default=True,
+@click.option("--sigma-mm", type=Finite(0.01, 100), default=2.0, show_default=True,
               help="Of each coordinate, where FILE has no column sigma_mm.")  # fmt: skip
 @click.option("--layout", metavar="ID=CORNER,...",
               help="What points of other names are: 101=BM1-TL,102=BM1-TR (of one tag: BM1-17-TL).")  # fmt: skip

@@ -65,4 +65,11 @@ def file_findings(site: Site, source: Source) -> Iterator[Finding]:
             f"{files['checks'].name}: every shot lies more than {FAR_SHOT_M:.0f} m above or below the design floor; "
             "are its columns in the order that [checks] order says, and in the site's unit?",
         )
+    if not len(shots):
+        yield Finding(
+            "warning",
+            f"{files['checks'].name}: there is no shot in it, so the report will have no independent check of its "
+            "accuracy; export the shots again",
+        )
+        return
     yield Finding("ok", f"{files['checks'].name}: {len(shots)} check shots")

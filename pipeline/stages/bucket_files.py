@@ -225,7 +225,7 @@ def _of_one_point(
     if text not in known and not len(rows):
         raise CalibrationError(
             f"--point {text}: no such point among the known points of site.toml, and no such row in "
-            f"the file; give E,N,H in the grid unit, or one of {', '.join(known) or 'none'}"
+            f"the file; give E,N,H in the grid unit, or one of {', '.join(sorted({*known, *names})[:9]) or 'none'}"
         )
     if text in known:
         point = known[text]

@@ -7,6 +7,8 @@ replaced, and the sheet comes first, so that no value stands in a file without t
 from __future__ import annotations
 
 import datetime
+import os
+import stat
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +19,7 @@ import numpy as np
 from pipeline.config import Site, load_machine, load_site
 from pipeline.config.document import decode, read_file
 from pipeline.config.rewriting import with_values
+from pipeline.errors import ArtefactError
 from pipeline.geometry import so3
 from pipeline.report.sheet import Demand, Sheet, render_sheet
 from pipeline.runs import atomic_write, json_bytes, sha256_of_file
@@ -85,6 +88,19 @@ def lens_table(
     }
 
 
+def refuse_read_only(file: Path) -> None:
+    """Raise ArtefactError where values could not be put into a file, before any work is done for them."""
+    if file.is_file() and not file.stat().st_mode & 0o222:
+        raise ArtefactError(
+            f"{file} is read-only, and values would be put into it; make it writable, or name a copy"
+        )
+    if not os.access(file.parent, os.W_OK):
+        raise ArtefactError(
+            f"{file.parent} cannot be written to, and {file.name} would be replaced there with the old one beside it; "
+            "make the folder writable, or name a copy"
+        )
+
+
 def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:
     """Set values in a machine.toml or site.toml; where the old one is kept.
 
@@ -116,8 +132,10 @@ def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-{changed}-{number}{file.suffix}")).exists():
         number += 1
+    mode = stat.S_IMODE(file.stat().st_mode)
     atomic_write(kept, old)
     atomic_write(file, text.encode("utf-8"))
+    file.chmod(mode)
     return kept
 
 

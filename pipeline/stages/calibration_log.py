@@ -14,6 +14,7 @@ from pipeline.config import Machine, Site
 from pipeline.errors import ConfigError
 from pipeline.runs import NEVER_RUN, RunFolder
 from pipeline.stages import Stage, stage_named
+from pipeline.stages.calibrated import refuse_read_only
 from pipeline.stages.job import Job, open_log
 from pipeline.stages.runner import Watch, run_stale
 
@@ -52,13 +53,23 @@ class CalibrationLog:
 
 
 def machine_to_write(job: Job, given: Path | None) -> Path:
-    """The machine.toml that values go into. Raises ConfigError where there is only the one inside the log."""
+    """The machine.toml that values go into.
+
+    Raises
+    ------
+    ConfigError
+        There is only the one inside the log.
+    ArtefactError
+        It is read-only, or its folder is.
+    """
     if job.machine_source.origin == "attachment":
         raise ConfigError(
             f"{job.log} has only the machine.toml inside it, and nothing can be written there; put one beside the log, "
             "or name it with --machine"
         )
-    return given or job.log.parent / "machine.toml"
+    file = given or job.log.parent / "machine.toml"
+    refuse_read_only(file)
+    return file
 
 
 @contextmanager

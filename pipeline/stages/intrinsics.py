@@ -24,7 +24,7 @@ from pipeline.logs.channels import IMAGE
 from pipeline.logs.reader import read_log
 from pipeline.report.intrinsics_sheet import intrinsics_sheet
 from pipeline.runs import sha256_of_file
-from pipeline.stages.calibrated import Written, lens_table, provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, lens_table, provenance, put_into, put_sheet, refuse_read_only
 
 COMMAND = "gradetrace calibrate intrinsics"
 MOST_PICTURES = 400
@@ -95,6 +95,7 @@ def calibrate_intrinsics(
     """
     printed, lens = parse_board(board), LENSES[model]
     if machine is not None:
+        refuse_read_only(machine)
         topic = topic or _topic_of(machine, camera)
     source = _the_one(source)
     finder = CornerFinder(printed)

@@ -75,10 +75,15 @@ def parse_at(text: str) -> tuple[tuple[float, float, float] | None, tuple[float,
             pairs = dict(part.split("=") for part in text.replace(" ", "").split(","))
             if set(pairs) != {"reach", "depth"}:
                 raise fault
-            return None, (float(pairs["reach"]), float(pairs["depth"]))
-        boom, stick, bucket = (float(part) for part in text.split(","))
+            boom, stick, bucket = float(pairs["reach"]), float(pairs["depth"]), 0.0
+        else:
+            boom, stick, bucket = (float(part) for part in text.split(","))
     except ValueError:
         raise fault from None
+    if not np.isfinite(boom + stick + bucket):
+        raise fault
+    if "=" in text:
+        return None, (boom, stick)
     return (boom, stick, bucket), None
 
 

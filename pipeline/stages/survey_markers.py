@@ -18,7 +18,15 @@ from pipeline.config.quantities import Print
 from pipeline.errors import CalibrationError
 from pipeline.geometry import so3
 from pipeline.report.survey_sheet import survey_sheet
-from pipeline.stages.calibrated import Written, demand_of, provenance, put_into, put_sheet, written_covariance
+from pipeline.stages.calibrated import (
+    Written,
+    demand_of,
+    provenance,
+    put_into,
+    put_sheet,
+    refuse_read_only,
+    written_covariance,
+)
 from pipeline.surface.shots import Shots, read_shots
 
 COMMAND = "gradetrace survey"
@@ -63,6 +71,7 @@ def run(
         Nothing is written then.
     """
     model = load_site(decode(read_file(site), str(site)), str(site))
+    refuse_read_only(site)
     if not file.is_file():
         raise CalibrationError(f"{file}: no such file; name the surveyor's file of corners")
     shots = read_shots(file, order, model.grid.metres_per_unit)

@@ -40,6 +40,11 @@ def test_northing_and_easting_exchanged_are_told_before_the_report(said):
     assert "with northing and easting exchanged 17 do" in sentence
 
 
+def test_a_file_without_a_shot_is_no_check(said):
+    level, sentence = said(lambda row: [])[-1]
+    assert level == "warning" and "there is no shot in it" in sentence
+
+
 def test_shots_that_lie_nowhere_near_the_floor_are_told(said):
     found = said(lambda row: [*row[:3], str(float(row[3]) / 0.3048), *row[4:]])
     assert ("warning", True) in [

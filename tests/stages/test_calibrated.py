@@ -1,0 +1,61 @@
+"""What a calibration may write, and what it leaves as it was."""
+
+from __future__ import annotations
+
+import stat
+
+import pytest
+from click.testing import CliRunner
+
+from pipeline.__main__ import main
+from pipeline.errors import ArtefactError
+from pipeline.resources import template_folder
+from pipeline.stages.calibrated import put_into, refuse_read_only
+
+SAMPLE = template_folder().parent / "sample_logs" / "trench"
+
+
+@pytest.fixture
+def machine(tmp_path):
+    file = tmp_path / "machine.toml"
+    file.write_bytes((SAMPLE / "machine.toml").read_bytes())
+    return file
+
+
+def test_a_read_only_file_is_refused_before_any_work(machine):
+    refuse_read_only(machine)
+    machine.chmod(0o444)
+    with pytest.raises(ArtefactError, match=r"machine\.toml is read-only"):
+        refuse_read_only(machine)
+
+
+def test_who_may_read_a_file_stays_as_it_was(machine):
+    machine.chmod(0o640)
+    kept = put_into(machine, "machine", {"cutting_edge.width_m": 1.1})
+    assert stat.S_IMODE(machine.stat().st_mode) == 0o640
+    assert kept.read_bytes() == (SAMPLE / "machine.toml").read_bytes()
+    assert "width_m = 1.1" in machine.read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        ["--sigma-px", "nan"],
+        ["--looks", "inf"],
+        ["--looks", "1e308"],
+        ["--frame-rate", "nan"],
+        ["--boom", "nan"],
+        ["--ground", "1e300"],
+        ["--at", "nan,nan,nan"],
+        ["--at", "reach=inf,depth=1"],
+        ["--area", "nan:nan"],
+        ["--area", "0:inf"],
+        ["--out", "plan.json"],
+    ],
+)
+def test_wishes_that_are_no_numbers_are_usage(tmp_path, monkeypatch, wrong):
+    monkeypatch.chdir(tmp_path)
+    files = [str(SAMPLE / name) for name in ("machine.toml", "site.toml")]
+    done = CliRunner().invoke(main, ["plan", *files, *wrong])
+    assert done.exit_code == 2 or getattr(done.exception, "exit_code", None) == 2, done.output
+    assert not list(tmp_path.iterdir())
