@@ -12,7 +12,7 @@ from pipeline.errors import CalibrationError
 from pipeline.report.belt_sheet import belt_sheet
 from pipeline.report.sheet import SHARE
 from pipeline.stages.bucket_files import COMMAND, belt_values, points_of
-from pipeline.stages.calibrated import Written, provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, provenance, put_into
 from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 from pipeline.surface.shots import NO_TIME
@@ -40,8 +40,8 @@ def run(
         sheet = belt_sheet(told, allowed_m, found.machine.machine.id, found.origin)
         stamp = provenance(found.date, COMMAND, found.job.log, found.job.log_sha256)
         page = found.folder / "belt.html"
-        put_sheet(sheet, page)
-        kept = put_into(found.machine_file, "machine", belt_values(found.machine, told, stamp))
+        values = belt_values(found.machine, told, stamp)
+        kept = put_into(found.machine_file, "machine", values, sheet, page)
     return Written(sheet.sentence, tuple(sheet.remarks), page, found.machine_file, kept)
 
 

@@ -20,7 +20,7 @@ from pipeline.report.sheet import SHARE
 from pipeline.runs import RunFolder
 from pipeline.stages import calibrate_belt, stage_named
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
-from pipeline.stages.calibrated import Written, put_into, put_sheet
+from pipeline.stages.calibrated import Written, put_into
 from pipeline.stages.calibration_log import machine_to_write
 from pipeline.stages.job import Job, check_log_file, describe, open_log
 from pipeline.stages.runner import Watch, run_if_stale
@@ -112,8 +112,7 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Written:
         )
         values = wear_values(machine, facts) if kept is None else values_of(machine, joint, name, kept, facts)
         sheet, page = bucket_sheet(facts), folder.file("bucket.html")
-        put_sheet(sheet, page)
-        before = put_into(machine_file, "machine", values)
+        before = put_into(machine_file, "machine", values, sheet, page)
     return Written(sheet.sentence, tuple(sheet.remarks), page, machine_file, before)
 
 

@@ -19,7 +19,6 @@ from pipeline.stages.calibrated import (
     pose_table,
     provenance,
     put_into,
-    put_sheet,
     written_covariance,
 )
 from pipeline.stages.calibration_log import CalibrationLog, searched
@@ -58,8 +57,7 @@ def run(
         )
         values = values_of(cluster, found, free_intrinsics)
         page = found.folder / "calibration-cluster.html"
-        put_sheet(sheet, page)
-        kept = put_into(found.machine_file, "machine", values)
+        kept = put_into(found.machine_file, "machine", values, sheet, page)
     return Written(sheet.sentence, tuple(sheet.remarks), page, found.machine_file, kept)
 
 

@@ -14,7 +14,7 @@ from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody
 from pipeline.errors import CalibrationError
 from pipeline.report.mounts_sheet import mounts_sheet
-from pipeline.stages.calibrated import Written, demand_of, pose_table, provenance, put_into, put_sheet
+from pipeline.stages.calibrated import Written, demand_of, pose_table, provenance, put_into
 from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 from pipeline.surface.shots import NO_TIME, order_of, read_shots
@@ -49,8 +49,7 @@ def run(
         stamp = provenance(found.date, COMMAND, found.job.log, found.job.log_sha256)
         values: dict[str, Any] = {t.key: pose_table(t.T, t.covariance, stamp) for t in mounts.told}
         page = found.folder / "calibration-mounts.html"
-        put_sheet(sheet, page)
-        kept = put_into(found.machine_file, "machine", values)
+        kept = put_into(found.machine_file, "machine", values, sheet, page)
     return Written(sheet.sentence, tuple(sheet.remarks), page, found.machine_file, kept)
 
 

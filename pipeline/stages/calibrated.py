@@ -101,8 +101,8 @@ def refuse_read_only(file: Path) -> None:
         )
 
 
-def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:
-    """Set values in a machine.toml or site.toml; where the old one is kept.
+def put_into(file: Path, kind: str, values: Mapping[str, Any], sheet: Sheet, page: Path) -> Path:
+    """Set values in a machine.toml or site.toml, with their sheet; where the old one is kept.
 
     Parameters
     ----------
@@ -112,6 +112,8 @@ def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:
         `machine` or `site`.
     values : mapping
         Dotted key -> value, as `config.rewriting.with_values` takes them.
+    sheet, page : Sheet, Path
+        What tells how good they are, and where it goes.
 
     Returns
     -------
@@ -128,6 +130,7 @@ def put_into(file: Path, kind: str, values: Mapping[str, Any]) -> Path:
     old = read_file(file)
     text = with_values(decode(old, str(file)), str(file), values)
     LOADERS[kind](text, str(file))
+    put_sheet(sheet, page)
     changed = datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC).date().isoformat()
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-{changed}-{number}{file.suffix}")).exists():

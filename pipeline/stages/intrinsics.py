@@ -148,10 +148,11 @@ def calibrate_intrinsics(
         stamp = provenance(date, COMMAND, source, sha256)
         values = lens_table(found.size, told.intrinsics, told.covariance, stamp)
     out = out or Path(f"intrinsics-{name}.html")
-    put_sheet(sheet, out)
     kept = None
     if machine is not None and values is not None:
-        kept = put_into(machine, "machine", {f"cameras.{camera}.intrinsics": values})
+        kept = put_into(machine, "machine", {f"cameras.{camera}.intrinsics": values}, sheet, out)
+    else:
+        put_sheet(sheet, out)
     return LensWritten(
         sheet.sentence, tuple(sheet.remarks), out, machine if kept is not None else None, kept, found
     )

@@ -23,7 +23,6 @@ from pipeline.stages.calibrated import (
     demand_of,
     provenance,
     put_into,
-    put_sheet,
     refuse_read_only,
     written_covariance,
 )
@@ -92,8 +91,7 @@ def run(
         values[f"benchmarks.{pose.name}.sigma_corner_mm"] = None
         values[f"benchmarks.{pose.name}.pose"] = _pose_table(pose, model, stamp)
     page = site.with_name(f"{file.stem}-survey.html")
-    put_sheet(sheet, page)
-    kept = put_into(site, "site", values)
+    kept = put_into(site, "site", values, sheet, page)
     return Written(sheet.sentence, tuple(sheet.remarks), page, site, kept)
 
 

@@ -8,11 +8,13 @@ import pytest
 from click.testing import CliRunner
 
 from pipeline.__main__ import main
-from pipeline.errors import ArtefactError
+from pipeline.errors import ArtefactError, ConfigError
+from pipeline.report.sheet import Sheet
 from pipeline.resources import template_folder
 from pipeline.stages.calibrated import put_into, refuse_read_only
 
 SAMPLE = template_folder().parent / "sample_logs" / "trench"
+SHEET = Sheet("Lens", "bench", "good", "Good enough.")
 
 
 @pytest.fixture
@@ -31,10 +33,17 @@ def test_a_read_only_file_is_refused_before_any_work(machine):
 
 def test_who_may_read_a_file_stays_as_it_was(machine):
     machine.chmod(0o640)
-    kept = put_into(machine, "machine", {"cutting_edge.width_m": 1.1})
+    kept = put_into(machine, "machine", {"cutting_edge.width_m": 1.1}, SHEET, machine.with_name("sheet.html"))
     assert stat.S_IMODE(machine.stat().st_mode) == 0o640
     assert kept.read_bytes() == (SAMPLE / "machine.toml").read_bytes()
     assert "width_m = 1.1" in machine.read_text(encoding="utf-8")
+
+
+def test_values_that_the_file_may_not_have_leave_no_sheet_either(machine):
+    before = machine.read_bytes()
+    with pytest.raises(ConfigError):
+        put_into(machine, "machine", {"cutting_edge.width_m": -1.0}, SHEET, machine.with_name("sheet.html"))
+    assert machine.read_bytes() == before and [f.name for f in machine.parent.iterdir()] == ["machine.toml"]
 
 
 @pytest.mark.parametrize(
