@@ -108,6 +108,11 @@ def held_point(
             f"shot '{name}': no picture of the log within {HOLD_S:g} s of it shows '{what}'; check its time and "
             "its zone"
         )
+    if np.ptp(seconds[near]) < HOLD_S:
+        raise CalibrationError(
+            f"shot '{name}': pictures of '{what}' span {np.ptp(seconds[near]):.1f} s of the {2 * HOLD_S:g} s about it, "
+            "too few to tell that it stood; shoot while the machine stands before the cameras"
+        )
     epoch = int(near[np.argmin(np.abs(seconds[near]))])
     p = se3.transform(se3.inverse(track.T_world_body[near]), p_world)
     moved = float(np.linalg.norm(np.ptp(p, axis=0)))

@@ -109,7 +109,9 @@ def calibrate_mounts(
     starts: dict[str, np.ndarray] = {}
     axes: dict[str, Axis] = {}
     for joint in joints:
-        if joint in surveyed and not any(m.body == joint for m in machine.markers.values()):
+        carried = {n: _sightings(machine, n, seen) for n, m in machine.markers.items() if m.body == joint}
+        if joint in surveyed and not sum(carried.values()):
+            keys = [key for key in keys if key not in {f"markers.{n}.mount" for n in carried}]
             starts[axis_static(joint)] = _axis_in_file(machine, joint)
             continue
         axes[joint], marker = _axis_alone(cut, site, joint, keys, seen)

@@ -59,19 +59,9 @@ def predict_elsewhere(setup: Setup, postures: Postures, shift: Prediction) -> Pr
     found = looks(setup.network, postures, seen, setup.looking, like=shift.found)
     S = np.eye(found.statics.size)
     place = {s.name: k for k, s in enumerate(found.network.statics)}
-    ours, theirs = [], []
-    for k, static in enumerate(shift.found.network.statics):
-        if static.name in place:
-            ours.append(found.statics.columns[place[static.name]])
-            theirs.append(shift.found.statics.columns[k])
-    a, b = np.concatenate(ours), np.concatenate(theirs)
-    # Of statics that only the shift saw, the rest must not know: they are integrated out.
-    other = np.setdiff1d(np.arange(len(shift.S)), b)
-    kept = shift.S[np.ix_(b, b)]
-    if len(other):
-        cross = shift.S[np.ix_(b, other)]
-        kept = kept - cross @ np.linalg.solve(shift.S[np.ix_(other, other)], cross.T)
-    S[np.ix_(a, a)] = kept
+    # Put together with the shift's looks, these have all statics that those have, and perhaps more.
+    at = np.concatenate([found.statics.columns[place[static.name]] for static in shift.found.network.statics])
+    S[np.ix_(at, at)] = shift.S
     return Prediction(edge_plan(found, S, setup.looking, setup.densities), seen, found, S)
 
 

@@ -68,6 +68,20 @@ def test_what_carries_the_edge_moves_it_by_its_own_lever():
     )
 
 
+def test_a_lens_moves_the_edge_by_the_turn_and_the_stretch_of_its_rays():
+    text = SAMPLE.read_text(encoding="utf-8")
+    machine = load_machine(text, "machine.toml")
+    lens = machine.cameras["bench"].intrinsics
+    for key, moved_px, expected_mm in (
+        ("cx", 0.5, 8000 * 0.5 / lens.fx),
+        ("fx", 0.6, 8000 * 0.6 / lens.fx / 3),
+    ):
+        value = getattr(lens, key) + moved_px
+        new = load_machine(with_values(text, "m", {f"cameras.bench.intrinsics.{key}": value}), "machine.toml")
+        (_, change) = history([machine, new], TODAY, 8.0)["cameras.bench.intrinsics"]
+        assert change.edge_mm == pytest.approx(expected_mm, rel=1e-6)
+
+
 def test_one_file_and_a_day_before_its_calibrations_are_said(tmp_path):
     (tmp_path / "machine.toml").write_text(texts()[2], encoding="utf-8")
     _, sentences = calibrate_history.run([tmp_path / "machine.toml"], TODAY, 8.0)

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.calibration.axes import TOLD
-from pipeline.calibration.mounts import calibrate_mounts
+from pipeline.calibration.mounts import ToldPose, calibrate_mounts
 from pipeline.errors import CalibrationError
 from pipeline.geometry import se3
-from pipeline.report.mounts_sheet import mounts_sheet
+from pipeline.report.mounts_sheet import edge_sigma_m, mounts_sheet
 from pipeline.report.sheet import Demand, render_sheet
 from pipeline.synthetic.calibration_sites import BUCKET_BOARD
 from tests.calibration.waving import seen, yard
@@ -46,6 +46,29 @@ def test_axis_and_board_lie_within_their_covariances(rig):
     assert off @ np.linalg.solve(Q, off) < 18.5
     assert np.sqrt(np.diagonal(P))[:2].max() < 0.002
     assert np.rad2deg(np.sqrt(np.diagonal(P))[2:].max()) < 0.06
+
+
+def test_what_no_motion_tells_of_an_axis_keeps_the_files_own_sigma(rig):
+    """Where the frame lies along the line and where its angle is zero: with a board whose mount is told along."""
+    _, machine, site, detections = rig
+    found = told(calibrate_mounts(machine, site, [AXIS], detections), AXIS)
+    file = np.diagonal(machine.bodies["bucket"].axis.covariance_xi())
+    kept = [i for i in range(6) if i not in TOLD]
+    assert np.diagonal(found.covariance)[kept] == pytest.approx(file[kept], rel=1e-6)
+    assert found.covariance[np.ix_(kept, list(TOLD))] == pytest.approx(0, abs=1e-9)
+
+
+def test_a_turn_counts_at_the_edge_with_its_lever():
+    sigma = np.deg2rad(0.02)
+    for key, turned, expected_m in (
+        ("cameras.bench.mount", 4, 3.0 * sigma),
+        ("markers.board.mount", 5, 3.0 * sigma),
+        ("bodies.bucket.axis", 5, 0.0),  # a convention
+        ("bodies.bucket.axis", 4, 3.0 * sigma),
+    ):
+        covariance = np.zeros((6, 6))
+        covariance[turned, turned] = sigma**2
+        assert edge_sigma_m(ToldPose(key, np.eye(4), covariance, None), 3.0) == pytest.approx(expected_m)
 
 
 @pytest.mark.slow

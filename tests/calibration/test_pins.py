@@ -132,6 +132,27 @@ def test_a_pin_shot_while_the_arm_moves_is_refused(rig):
         )
 
 
+def test_pins_do_without_the_marker_that_the_file_has_and_no_camera_saw(rig):
+    drawn, machine, site, detections, pins = rig
+    stick = next(iter(machine.markers.values()))
+    tag = stick.tags[0].model_copy(update={"id": 99})
+    unseen = stick.model_copy(update={"body": "bucket", "mount": None, "tags": (tag,)})
+    more = machine.model_copy(update={"markers": {**machine.markers, "bucket-board": unseen}})
+    found = calibrate_mounts(more, site, (KEY,), detections, pins)
+    e = error(drawn, next(t for t in found.told if t.key == KEY))
+    assert np.hypot(*e[:2]) < 0.01
+
+
+def test_a_shot_that_few_pictures_surround_is_refused(rig):
+    drawn, machine, site, detections, _ = rig
+    few = {}
+    for name, rows in detections.items():
+        at_s = (np.asarray(rows["time_ns"]) - drawn.spec.start_utc_ns) / 1e9
+        few[name] = {key: column[(at_s > 2.0) & (at_s < 3.1)] for key, column in rows.items()}
+    with pytest.raises(CalibrationError, match="too few to tell that it stood"):
+        calibrate_mounts(machine, site, (), few, shots(drawn, np.random.default_rng(1)))
+
+
 def test_a_shot_of_another_day_is_refused(rig):
     _, machine, site, detections, pins = rig
     late = [replace(shot, time_ns=shot.time_ns + 86_400_000_000_000) for shot in pins]
