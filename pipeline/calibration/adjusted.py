@@ -147,8 +147,8 @@ def adjusted(
     sentences += [f.sentence for f in untold if f.kind in ("gauge", "line")]
     if settled.rounds == 0:
         sentences.append(
-            "how still the machine stood at its stops could not be told from the log: pictures of several cameras at one "
-            "stop are tied by the motion prior of machine.toml, and are less sure than they could be"
+            "how still the machine stood at its stops could not be told from the log: pictures of several cameras at "
+            "one stop are tied by the motion prior of machine.toml, and are less sure than they could be"
         )
     sentences += diagnostics.stiff_motion(diagnostics.motion_fit(problem, optimum.values))
     return Adjusted(

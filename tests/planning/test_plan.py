@@ -118,8 +118,8 @@ def test_why_a_tag_is_not_seen():
     assert one_tag(in_front(8.0)) == SEEN
     assert one_tag(in_front(17.0)) == SEEN
     assert one_tag(in_front(18.0)) == TOO_SMALL
-    assert one_tag(in_front(8.0, 74.0), least_px=30.0) == SEEN
-    assert one_tag(in_front(8.0, 80.0), least_px=30.0) == TURNED_AWAY
+    assert one_tag(in_front(8.0, 74.0), least_px=5.0) == SEEN
+    assert one_tag(in_front(8.0, 80.0), least_px=5.0) == TURNED_AWAY
     assert one_tag(in_front(8.0, 180.0)) == TURNED_AWAY
     assert one_tag(in_front(8.0, aside=7.0)) == OUTSIDE
     assert one_tag(in_front(-8.0)) == OUTSIDE
