@@ -12,7 +12,7 @@ from pipeline.errors import CalibrationError
 from pipeline.report.belt_sheet import belt_sheet
 from pipeline.report.sheet import SHARE
 from pipeline.stages.bucket_files import COMMAND, belt_values, points_of
-from pipeline.stages.calibrated import Written, provenance, put_into
+from pipeline.stages.calibrated import Written, provenance, put_into, refuse_twice
 from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 from pipeline.surface.shots import NO_TIME
@@ -34,6 +34,7 @@ def run(
     """Calibrate a belt by the touches of a check file and write it. Raises PipelineError; nothing is written then."""
     with searched(log, machine, site, runs, workers, watch) as found:
         touches, known = edge_touches(checks, point, found.site, tooth, contact_m)
+        refuse_twice(found.machine, found.job.log_sha256, ())
         told = calibrate_belt(found.machine, found.site, belt, found.detections, touches, known)
         tolerance = found.site.tolerance
         allowed_m = min(tolerance.high_mm, tolerance.low_mm) / 1000 * SHARE

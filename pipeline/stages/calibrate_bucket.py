@@ -20,7 +20,7 @@ from pipeline.report.sheet import SHARE
 from pipeline.runs import RunFolder
 from pipeline.stages import calibrate_belt, stage_named
 from pipeline.stages.bucket_files import points_of, rig_of, values_of, wear_values, worn_m
-from pipeline.stages.calibrated import Written, put_into
+from pipeline.stages.calibrated import Written, put_into, refuse_twice
 from pipeline.stages.calibration_log import machine_to_write
 from pipeline.stages.job import Job, check_log_file, describe, open_log
 from pipeline.stages.runner import Watch, run_if_stale
@@ -81,6 +81,7 @@ def calibrate_bucket(wanted: Wanted, watch: Watch) -> Written:
     machine, site = job.machine, job.site
     machine_file = machine_to_write(job, wanted.machine)
     name = sensor_of(machine, wanted.sensor)
+    refuse_twice(machine, job.log_sha256, () if wanted.wear else (f"sensors.{name}.curve",))
     reduced, joint = machine_to_the_pin(machine)
     to_the_pin = replace(job, machine=reduced)
     with folder.locked():

@@ -19,6 +19,7 @@ from pipeline.stages.calibrated import (
     pose_table,
     provenance,
     put_into,
+    refuse_twice,
     written_covariance,
 )
 from pipeline.stages.calibration_log import CalibrationLog, searched
@@ -47,6 +48,9 @@ def run(
     """
     with searched(log, machine, site, runs, workers, watch) as found:
         reference = reference or default_reference(found.machine)
+        refuse_twice(
+            found.machine, found.job.log_sha256, [f"cameras.{n}.mount" for n in found.machine.cameras]
+        )
         cluster = calibrate_cluster(found.machine, found.site, reference, found.detections)
         sheet = cluster_sheet(
             cluster,

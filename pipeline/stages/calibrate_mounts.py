@@ -14,7 +14,7 @@ from pipeline.config import Machine, Site
 from pipeline.config.machine import JointBody
 from pipeline.errors import CalibrationError
 from pipeline.report.mounts_sheet import mounts_sheet
-from pipeline.stages.calibrated import Written, demand_of, pose_table, provenance, put_into
+from pipeline.stages.calibrated import Written, demand_of, pose_table, provenance, put_into, refuse_twice
 from pipeline.stages.calibration_log import searched
 from pipeline.stages.runner import Watch
 from pipeline.surface.shots import NO_TIME, order_of, read_shots
@@ -39,6 +39,7 @@ def run(
     """
     with searched(log, machine, site, runs, workers, watch) as found:
         shots = [] if pins is None else pin_shots(pins, found.machine, found.site)
+        refuse_twice(found.machine, found.job.log_sha256, [*free, *(f"bodies.{s.joint}.axis" for s in shots)])
         mounts = calibrate_mounts(found.machine, found.site, free, found.detections, shots)
         sheet = mounts_sheet(
             mounts,

@@ -9,17 +9,18 @@ from __future__ import annotations
 import datetime
 import os
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pipeline.config import Site, load_machine, load_site
+from pipeline.config import Machine, Site, load_machine, load_site
 from pipeline.config.document import decode, read_file
+from pipeline.config.quantities import calibrated_in
 from pipeline.config.rewriting import with_values
-from pipeline.errors import ArtefactError
+from pipeline.errors import ArtefactError, CalibrationError
 from pipeline.geometry import so3
 from pipeline.report.sheet import Demand, Sheet, render_sheet
 from pipeline.runs import atomic_write, json_bytes, sha256_of_file
@@ -98,6 +99,28 @@ def refuse_read_only(file: Path) -> None:
         raise ArtefactError(
             f"{file.parent} cannot be written to, and {file.name} would be replaced there with the old one beside it; "
             "make the folder writable, or name a copy"
+        )
+
+
+def refuse_twice(machine: Machine, log_sha256: str, anew: Collection[str]) -> None:
+    """Raise CalibrationError where a log told something of the file already that now is a prior of the same log.
+
+    Calibrated twice with one log, a bucket's U fell from 4.8 to 3.9 mm by nothing.
+
+    Parameters
+    ----------
+    machine : Machine
+        As loaded.
+    log_sha256 : str
+        Of the log.
+    anew : collection of str
+        Keys of what is told without its prior.
+    """
+    twice = [k for k, told in calibrated_in(machine) if told.sha256 == log_sha256 and k not in anew]
+    if twice:
+        raise CalibrationError(
+            f"{', '.join(twice)} of machine.toml was told by this very log, which would count twice; go on from the "
+            "file as it was before (machine.before-*.toml, put back or named with --machine), or record another log"
         )
 
 

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import datetime
 import stat
 
 import pytest
 from click.testing import CliRunner
 
 from pipeline.__main__ import main
-from pipeline.errors import ArtefactError, ConfigError
+from pipeline.config import load_machine
+from pipeline.config.rewriting import with_values
+from pipeline.errors import ArtefactError, CalibrationError, ConfigError
 from pipeline.report.sheet import Sheet
 from pipeline.resources import template_folder
-from pipeline.stages.calibrated import put_into, refuse_read_only
+from pipeline.stages.calibrated import put_into, refuse_read_only, refuse_twice
 
 SAMPLE = template_folder().parent / "sample_logs" / "trench"
 SHEET = Sheet("Lens", "bench", "good", "Good enough.")
@@ -44,6 +47,18 @@ def test_values_that_the_file_may_not_have_leave_no_sheet_either(machine):
     with pytest.raises(ConfigError):
         put_into(machine, "machine", {"cutting_edge.width_m": -1.0}, SHEET, machine.with_name("sheet.html"))
     assert machine.read_bytes() == before and [f.name for f in machine.parent.iterdir()] == ["machine.toml"]
+
+
+def test_a_log_that_told_a_prior_is_not_counted_twice(machine):
+    text = machine.read_text(encoding="utf-8")
+    stamp = {"date": datetime.date(2026, 5, 1), "by": "test", "source": "log.mcap", "sha256": "a" * 64}
+    told = load_machine(with_values(text, "m", {"cutting_edge.mount.calibrated": stamp}), "m")
+    refuse_twice(told, "b" * 64, ())
+    refuse_twice(told, "a" * 64, ("cutting_edge.mount",))
+    with pytest.raises(
+        CalibrationError, match=r"^cutting_edge\.mount of machine\.toml was told by this very log"
+    ):
+        refuse_twice(told, "a" * 64, ("sensors.bucket-pot.curve",))
 
 
 @pytest.mark.parametrize(
