@@ -244,11 +244,15 @@ def cluster_of(
     """As `calibrate_cluster`, from the network of `cluster_machine` and what was seen; `repeated` as for `adjusted`."""
     shared = shared_instants(network, observations)
     _refuse_unshared(network, shared, network.camera_index(reference))
-    whole = adjusted(network, observations, settings=site.estimation, repeated=repeated)
+    whole = adjusted(network, observations, settings=site.estimation, repeated=repeated, scaled=True)
     benchmarks = refuse_contradiction(whole)
     odd, even = (
         adjusted(
-            whole.network, _every_second(observations, half), settings=site.estimation, repeated=repeated
+            whole.network,
+            _every_second(observations, half),
+            settings=site.estimation,
+            repeated=repeated,
+            scaled=True,
         )
         for half in (0, 1)
     )

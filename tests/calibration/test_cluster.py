@@ -148,6 +148,21 @@ def test_a_print_of_another_size_contradicts_the_pictures(yard):
         cluster_of(network, seen(drawn, network, np.random.default_rng(0), scale=1.05), site, "bench")
 
 
+@pytest.mark.parametrize("stated", [0.7, 1.5])
+def test_corners_count_with_the_scatter_of_the_log_and_not_with_what_is_stated(yard, stated):
+    drawn, _, site, network = yard
+    rows = seen(drawn, network, np.random.default_rng(0))
+    found = [
+        cluster_of(network, replace(rows, cov=factor**2 * rows.cov), site, "bench", repeated=WHITE)
+        for factor in (1.0, stated)
+    ]
+    true, other = (f.pairs[0] for f in found)
+    print(f"{1e3 * true.sigma_m:.2f} mm, with sigmas {stated} times as large {1e3 * other.sigma_m:.2f} mm")
+    assert other.sigma_m == pytest.approx(true.sigma_m, rel=0.05)
+    assert other.sigma_rad == pytest.approx(true.sigma_rad, rel=0.05)
+    assert found[1].whole.sigma0 == pytest.approx(found[0].whole.sigma0 / stated, rel=0.05)
+
+
 @pytest.mark.parametrize("scale", [0.99, 1.01])
 def test_prints_one_in_a_hundred_off_are_named_by_the_benchmarks(yard, scale):
     """Their corners are at 1.3 of their sigma only; the mount was written 36 mm off, with a sigma of 2 mm."""
