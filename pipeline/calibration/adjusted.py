@@ -38,7 +38,7 @@ ten-thousandth for all axes but the one it turns about, and errors were 1.4 sigm
 is learned along with them."""
 
 SCATTER = (0.4, 10.0)
-"""Bounds of the variance that a log's corners are believed to have, of the stated one. At the stops of rendered logs it
+"""Bounds of the variance that a log's corners are believed to have, of the stated one. On the sample's log of stops it
 is 0.66; with the stated one cameras against each other were off by 0.85 of their sigma, 98.5 % of 720 figures within
 1.96 sigmas (120 machines), with that of the log by 0.92, 96.7 % (60)."""
 

@@ -149,9 +149,7 @@ def calibrate_belt(
             "written"
         )
     refuse_contradiction(whole)
-    moved = float(
-        se3.local(first.statics[told.index(axis_static(belt))].value, told.value(axis_static(belt)))[5]
-    )
+    moved = _turned(first, told, belt)
     if abs(moved) > MOST_MOVED * PHASE_RAD:
         raise CalibrationError(
             f"the phase of '{belt}' is {np.rad2deg(abs(moved)):.0f} deg from where machine.toml has it: bring "

@@ -149,12 +149,11 @@ def with_points(
         No answer was found.
     """
     prior = _Prior.of(whole, held, known_sigma_m)
-    everything = list(range(len(prior.held)))
-    y, P, each, square = prior.fitted(everything)
+    y, P, each, square = prior.fitted(range(len(prior.held)))
     size = sum(len(fit.off) for fit in each)
     wrong = square > chi2.isf(ALARM, size)
     wrong |= any(chi2.sf(fit.square, len(fit.off)) < ALARM / len(each) for fit in each)
-    culprit = prior.culprit(everything) if wrong else None
+    culprit = prior.culprit() if wrong else None
     fits = PointFits(
         tuple(fit.published() for fit in each),
         float(np.sqrt(square / size)),
@@ -216,7 +215,7 @@ class _Prior:
         covariance[first:, first:] = np.diag(np.repeat(np.square(known_sigma_m), 3))
         return cls(z_0, held, places, first, covariance)
 
-    def fitted(self, rows: list[int]) -> tuple[np.ndarray, np.ndarray, list[_Off], float]:
+    def fitted(self, rows: Sequence[int]) -> tuple[np.ndarray, np.ndarray, list[_Off], float]:
         """``y`` by some shots, its covariance, each of them against the others, and the sum of squares of all."""
         y = np.zeros(len(self.covariance))
         for _ in range(STEPS):
@@ -242,10 +241,11 @@ class _Prior:
             start = at.stop
         return y, self.covariance - K @ J @ self.covariance, each, float(r @ S_inverse @ r)
 
-    def culprit(self, rows: list[int]) -> _Off | None:
+    def culprit(self) -> _Off | None:
         """The only shot without which the others go together; none where there is no such one, or several."""
         cured = []
-        for k in rows if len(rows) > 1 else ():
+        rows = range(len(self.held)) if len(self.held) > 1 else ()
+        for k in rows:
             others = [j for j in rows if j != k]
             y, P, each, square = self.fitted(others)
             if square <= chi2.isf(ALARM, sum(len(fit.off) for fit in each)):

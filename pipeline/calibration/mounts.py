@@ -21,6 +21,7 @@ from pipeline.calibration.held_points import PointFit
 from pipeline.calibration.pins import PinShot, axis_static, with_pins
 from pipeline.config import Machine, Site
 from pipeline.config.machine import CuttingEdge, JointBody, MovingBody
+from pipeline.config.quantities import Pose
 from pipeline.errors import CalibrationError
 from pipeline.geometry import se3
 from pipeline.network import frames as fr
@@ -129,14 +130,15 @@ def calibrate_mounts(
     told = []
     for key in keys:
         name = static_of(key)
-        old = _in_file(machine, key)
+        file = _in_file(machine, key)
+        old = None if file is None else file.transform()
         joint = key.split(".")[1] if key.startswith("bodies.") else ""
         covariance = whole.covariance(name)
         if joint:
             covariance = covariance + _conventions(machine, keys, joint)
         told.append(ToldPose(key, whole.value(name), covariance, old, axes.get(joint)))
-    contradicted = [_against_file(machine, pose, surveyed) for pose in told if pose.T_file is not None]
-    return Mounts(whole, tuple(told), (*(c for c in contradicted if c), *whole.warnings), fits)
+    contradicted = [said for pose in told if (said := _against_file(machine, pose, surveyed))]
+    return Mounts(whole, tuple(told), (*contradicted, *whole.warnings), fits)
 
 
 def _against_file(machine: Machine, told: ToldPose, surveyed: Sequence[str]) -> str:
@@ -144,19 +146,18 @@ def _against_file(machine: Machine, told: ToldPose, surveyed: Sequence[str]) -> 
 
     Two ends of a pin have no third that would show a typing error in one, or a shift of both: only the file has.
     """
-    kind, name, what = told.key.split(".")
+    kind, name, _ = told.key.split(".")
     of = list(TOLD) if kind == "bodies" else list(range(6))
-    assert told.T_file is not None
-    moved = se3.local(told.T_file, told.T)
-    both = (told.covariance + getattr(getattr(machine, kind)[name], what).covariance_xi())[np.ix_(of, of)]
+    file = _in_file(machine, told.key)
+    if file is None:
+        return ""
+    moved = se3.local(file.transform(), told.T)
+    both = (told.covariance + file.covariance_xi())[np.ix_(of, of)]
     square = float(moved[of] @ np.linalg.solve(both, moved[of]))
     if square <= chi2.isf(CONTRADICTS, len(of)):
         return ""
-    places = [i for i in of if i < 3]
-    mm, deg = (
-        1000 * np.linalg.norm(moved[places]),
-        np.rad2deg(np.linalg.norm(moved[[i for i in of if i > 2]])),
-    )
+    seen = np.where(np.isin(np.arange(6), of), moved, 0.0)
+    mm, deg = 1000 * np.linalg.norm(seen[:3]), np.rad2deg(np.linalg.norm(seen[3:]))
     sigmas = np.sqrt(square)
     sentence = (
         f"{told.key} is {mm:.0f} mm and {deg:.1f} deg from where machine.toml has it, {sigmas:.0f} sigmas"
@@ -192,10 +193,10 @@ def _keys(machine: Machine, free: Sequence[str]) -> list[str]:
     return keys
 
 
-def _in_file(machine: Machine, key: str) -> np.ndarray | None:
+def _in_file(machine: Machine, key: str) -> Pose | None:
     kind, name, what = key.split(".")
-    pose = getattr(getattr(machine, kind)[name], what)
-    return None if pose is None else pose.transform()
+    pose: Pose | None = getattr(getattr(machine, kind)[name], what)
+    return pose
 
 
 def _without_sensors(machine: Machine, seen: Mapping[str, object]) -> Machine:

@@ -66,6 +66,15 @@ def distance(default: float, what: str, least: float = 0.5, most: float = 100) -
     )
 
 
+def finite_numbers(text: str, separator: str, count: int) -> list[float] | None:
+    """So many numbers with a separator between them; None where the text is anything else."""
+    try:
+        found = [float(part) for part in text.split(separator)]
+    except ValueError:
+        return None
+    return found if len(found) == count and all(map(math.isfinite, found)) else None
+
+
 def usable_cores() -> int:
     """Cores this process may use; a container or `taskset` may leave it fewer than the machine has."""
     try:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import click
 
-from pipeline.cli.options import Finite
+from pipeline.cli.options import Finite, finite_numbers
 from pipeline.errors import UsageError
 
 
@@ -46,7 +45,7 @@ def plan(machine: Path, site: Path, run: Path | None, area: str | None, at: str 
     """
     from pipeline.planning.work import Habits
     from pipeline.stages.calibrated import put_sheet
-    from pipeline.stages.plan import Wishes, parse_at, plan_of_files
+    from pipeline.stages.plan import Wishes, plan_of_files
 
     directions, reach_depth = parse_at(at) if at else (None, None)
     stations = _numbers("--area", area, ":", 2)
@@ -75,13 +74,27 @@ def plan(machine: Path, site: Path, run: Path | None, area: str | None, at: str 
     click.echo(f"plan: {out}")
 
 
+def parse_at(text: str) -> tuple[tuple[float, float, float] | None, tuple[float, float] | None]:
+    """``boom,stick,bucket`` in degrees, or ``reach=M,depth=M``.
+
+    Raises UsageError for anything else.
+    """
+    named = dict(part.strip().split("=", 1) for part in text.split(",") if "=" in part)
+    if not named and (angles := finite_numbers(text, ",", 3)) is not None:
+        return (angles[0], angles[1], angles[2]), None
+    if set(named) == {"reach", "depth"} and text.count(",") == 1:
+        place = finite_numbers(f"{named['reach']},{named['depth']}", ",", 2)
+        if place is not None:
+            return None, (place[0], place[1])
+    raise UsageError(
+        f"--at {text}: give boom,stick,bucket in degrees such as 30,-60,-100, or reach=6,depth=1.5"
+    )
+
+
 def _numbers(option: str, text: str | None, separator: str, count: int) -> list[float] | None:
     if text is None:
         return None
-    try:
-        found = [float(part) for part in text.split(separator)]
-    except ValueError:
-        found = []
-    if len(found) != count or not all(map(math.isfinite, found)):
+    found = finite_numbers(text, separator, count)
+    if found is None:
         raise UsageError(f"{option} {text}: give {count} numbers with '{separator}' between them")
     return found

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import datetime
-import math
 from pathlib import Path
 
 import click
 
-from pipeline.cli.options import FILE, Finite, distance, say_written
+from pipeline.cli.options import FILE, Finite, distance, finite_numbers, say_written
 from pipeline.errors import UsageError
 
 
@@ -66,12 +65,7 @@ def _layout(text: str | None) -> dict[str, str]:
 def _station(text: str | None) -> tuple[float, float, float] | None:
     if text is None:
         return None
-    try:
-        e, n, h = (float(part) for part in text.split(","))
-        if not math.isfinite(e + n + h):
-            raise ValueError
-    except ValueError:
-        raise UsageError(
-            "--station: write easting, northing and elevation, such as 356131.2,5812424.0,36.1"
-        ) from None
-    return e, n, h
+    found = finite_numbers(text, ",", 3)
+    if found is None:
+        raise UsageError("--station: write easting, northing and elevation, such as 356131.2,5812424.0,36.1")
+    return found[0], found[1], found[2]

@@ -73,11 +73,9 @@ def _load(text: str, source: str, model: type[Model]) -> Model:
         where = re.search(r"\(at line (\d+), column \d+\)", str(error))
         line = f":{where.group(1)}" if where else ""
         raise ConfigError(f"{source}{line}: not valid TOML: {error}") from None
-    other = {Machine: "site", Site: "machine"}[model]
-    if SIGNS[other] in data and SIGNS[model.__name__.lower()] not in data:
-        raise ConfigError(
-            f"{source}: is a {other}.toml, and a {model.__name__.lower()}.toml is needed in its place"
-        )
+    kind, other = ("machine", "site") if model is Machine else ("site", "machine")
+    if SIGNS[other] in data and SIGNS[kind] not in data:
+        raise ConfigError(f"{source}: is a {other}.toml, and a {kind}.toml is needed in its place")
     try:
         # Strict, or "3" and true would pass for numbers; strict knows tuples, TOML only lists.
         return model.model_validate(_tuples(data), strict=True)

@@ -154,14 +154,14 @@ def put_into(file: Path, kind: str, values: Mapping[str, Any], sheet: Sheet, pag
     text = with_values(decode(old, str(file)), str(file), values)
     LOADERS[kind](text, str(file))
     put_sheet(sheet, page)
-    changed = datetime.datetime.fromtimestamp(file.stat().st_mtime, datetime.UTC).date().isoformat()
+    before = file.stat()
+    changed = datetime.datetime.fromtimestamp(before.st_mtime, datetime.UTC).date().isoformat()
     number = 1
     while (kept := file.with_name(f"{file.stem}.before-{changed}-{number}{file.suffix}")).exists():
         number += 1
-    mode = stat.S_IMODE(file.stat().st_mode)
     atomic_write(kept, old)
     atomic_write(file, text.encode("utf-8"))
-    file.chmod(mode)
+    file.chmod(stat.S_IMODE(before.st_mode))
     return kept
 
 

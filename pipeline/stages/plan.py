@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.config import Machine, Site, load_machine, load_site
 from pipeline.config.document import decode, read_file
-from pipeline.errors import PlanningError, UsageError
+from pipeline.errors import PlanningError
 from pipeline.estimation.repeated import Repeated, information_share, rests
 from pipeline.geometry import se3
 from pipeline.network import network_of
@@ -60,31 +60,6 @@ class Wishes:
     """Of a corner of a tag of 40 px."""
     points: int = 100
     search: bool = True
-
-
-def parse_at(text: str) -> tuple[tuple[float, float, float] | None, tuple[float, float] | None]:
-    """``boom,stick,bucket`` in degrees, or ``reach=M,depth=M``.
-
-    Raises UsageError for anything else.
-    """
-    fault = UsageError(
-        f"--at {text}: give boom,stick,bucket in degrees such as 30,-60,-100, or reach=6,depth=1.5"
-    )
-    try:
-        if "=" in text:
-            pairs = dict(part.split("=") for part in text.replace(" ", "").split(","))
-            if set(pairs) != {"reach", "depth"}:
-                raise fault
-            boom, stick, bucket = float(pairs["reach"]), float(pairs["depth"]), 0.0
-        else:
-            boom, stick, bucket = (float(part) for part in text.split(","))
-    except ValueError:
-        raise fault from None
-    if not np.isfinite(boom + stick + bucket):
-        raise fault
-    if "=" in text:
-        return None, (boom, stick)
-    return (boom, stick, bucket), None
 
 
 def plan_of_files(

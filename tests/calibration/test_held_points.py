@@ -89,8 +89,7 @@ def test_shots_move_the_statics_as_a_dense_solve_does():
 
 def test_one_wrong_shot_is_named_and_two_are_not():
     whole, held = world(2, moved=4)
-    rows = list(range(len(held)))
-    culprit = _Prior.of(whole, held, [KNOWN_M]).culprit(rows)
+    culprit = _Prior.of(whole, held, [KNOWN_M]).culprit()
     assert (
         culprit is not None
         and culprit.name == "s4"
@@ -98,7 +97,7 @@ def test_one_wrong_shot_is_named_and_two_are_not():
     )
     # Where next to nothing is known, either of two explains the other away.
     whole, held = world(2, shots=2, moved=1, known=300.0)
-    assert _Prior.of(whole, held, [KNOWN_M]).culprit([0, 1]) is None
+    assert _Prior.of(whole, held, [KNOWN_M]).culprit() is None
 
 
 def test_shots_no_further_apart_than_the_machine_stood_have_one_pose():

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from pipeline.cli import main
+from pipeline.cli.plan import parse_at
 from pipeline.config import load_machine, load_site
 from pipeline.errors import PlanningError, UsageError
 from pipeline.estimation.repeated import Repeated
@@ -44,7 +45,6 @@ from pipeline.planning.sight import (
     sight,
 )
 from pipeline.planning.work import cab_pose
-from pipeline.stages.plan import parse_at
 from tests.planning.setups import LOOKING, network, posture, seen_from
 
 SAMPLE = Path("sample_logs/trench")
