@@ -247,7 +247,10 @@ class _Prior:
         rows = range(len(self.held)) if len(self.held) > 1 else ()
         for k in rows:
             others = [j for j in rows if j != k]
-            y, P, each, square = self.fitted(others)
+            try:
+                y, P, each, square = self.fitted(others)
+            except CalibrationError:  # the wrong one is among them
+                continue
             if square <= chi2.isf(ALARM, sum(len(fit.off) for fit in each)):
                 r, J, noise = self.linearised(k, y)
                 cured.append(_Off(self.held[k].name, r, J @ P @ J.T + noise))

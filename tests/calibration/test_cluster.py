@@ -165,7 +165,6 @@ def test_corners_count_with_the_scatter_of_the_log_and_not_with_what_is_stated(y
 
 @pytest.mark.parametrize("scale", [0.99, 1.01])
 def test_prints_one_in_a_hundred_off_are_named_by_the_benchmarks(yard, scale):
-    """Their corners are at 1.3 of their sigma only; the mount was written 36 mm off, with a sigma of 2 mm."""
     drawn, _, site, network = yard
     with pytest.raises(
         CalibrationError, match=r"\d+ of \d+ benchmarks are off: most likely the prints are of another"
@@ -177,6 +176,19 @@ def test_prints_one_in_a_hundred_off_are_named_by_the_benchmarks(yard, scale):
             "bench",
             repeated=WHITE,
         )
+
+
+def test_what_a_print_one_in_a_hundred_too_large_would_have_put_into_the_file(yard, monkeypatch):
+    drawn, _, site, network = yard
+    monkeypatch.setattr(clusters, "refuse_contradiction", lambda whole: {})
+    found = cluster_of(
+        network, seen(drawn, network, np.random.default_rng(0), scale=1.01), site, "bench", repeated=WHITE
+    )
+    off_m = np.linalg.norm(error_of(drawn, found.pairs[0])[:3])
+    print(
+        f"mount {1e3 * off_m:.0f} mm off, sigma {1e3 * found.pairs[0].sigma_m:.1f} mm, sigma0 {found.whole.sigma0:.2f}"
+    )
+    assert off_m > 10 * found.pairs[0].sigma_m and found.whole.sigma0 < 2
 
 
 def test_one_benchmark_with_a_wrong_survey_is_named_alone(yard):
