@@ -61,6 +61,9 @@ def _drawing(hand_off: HandOff) -> bytes:
     _add_marks(space, hand_off.stations, STATIONS, STATION_TEXT, scale)
     _add_marks(space, hand_off.checks, CHECKS, CHECK_TEXT, scale)
     _look_at(document, space, hand_off, scale)
+    # The library adds the classes of what is drawn in the order of a set, which is another in every process.
+    for name in sorted(document.entitydb.dxf_types_in_use()):
+        document.classes.add_class(name)
     text = io.StringIO()
     document.write(text)
     return document.encode(text.getvalue())

@@ -3,6 +3,10 @@
 import io
 import itertools
 import math
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import ezdxf
 import numpy as np
@@ -334,6 +338,26 @@ def test_a_drawing_repeats_byte_for_byte_and_leaves_the_library_as_it_was():
     drawing = ezdxf.read(io.StringIO(first.decode("utf-8")))
     assert set(drawing_exchange.LAYERS) <= {layer.dxf.name for layer in drawing.layers}
     assert len(drawing.audit().errors) == 0
+
+
+def test_a_drawing_has_the_same_bytes_in_every_process():
+    """Names are hashed anew in each, and the library puts a set of them into the file: once in two it was another."""
+    code = (
+        "import hashlib; from tests.surface.test_hand_off import dxf_bytes, handed; "
+        "print(hashlib.sha256(dxf_bytes(handed())).hexdigest())"
+    )
+    digests = set()
+    for seed in ("1", "2", "3", "4", "5"):
+        done = subprocess.run(
+            [sys.executable, "-c", code],
+            env={**os.environ, "PYTHONHASHSEED": seed},
+            cwd=Path(__file__).parents[2],
+            capture_output=True,
+            text=True,
+            check=True,
+        )
+        digests.add(done.stdout)
+    assert len(digests) == 1
 
 
 def test_a_drawing_opens_where_the_trench_is():
